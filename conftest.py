@@ -10,6 +10,7 @@ import tempfile
 import pytest
 from small import OPTIONS
 
+import s4a
 from s4a import analyse, coarsen, open_study, spectrum, synthetic
 
 
@@ -84,6 +85,13 @@ def low_brain(brain):
     return spectrum(coarsen(brain, n_coarse=900), k=40)
 
 
+@pytest.fixture
+def short_films(monkeypatch):
+    """Commands write films of two small pictures; long ones have tests of their own."""
+    film = s4a.write_film
+    monkeypatch.setattr(s4a, "write_film", lambda *what: film(*what, n_frames=2, width=100))
+
+
 def pytest_terminal_summary(terminalreporter):
     """Processor time and peak memory of every notebook that ran, and of all together."""
     reports = [r for kind in ("passed", "failed") for r in terminalreporter.getreports(kind)]
@@ -104,10 +112,21 @@ def pytest_terminal_summary(terminalreporter):
         )
 
 
-# files of few tests that take long begin first, so that no worker waits for the other at the end
-SLOW = ("test_notebooks", "test_site", "test_browser", "test_widgets", "test_pages", "test_release")
+# files that take long begin first, the longest before all, so that no worker waits for the other
+SLOW = ["notebooks", "browser", "site", "interruptions", "several", "complete", "panels_browser"]
+SLOW += [
+    "faults",
+    "widgets",
+    "scenes_browser",
+    "pages",
+    "release",
+    "growth",
+    "save_browser",
+    "kills",
+]
 
 
 def pytest_collection_modifyitems(items):
     """Slow files first; the others stay in their order."""
-    items.sort(key=lambda item: item.path.stem not in SLOW)
+    place = {f"test_{name}": i for i, name in enumerate(SLOW)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(SLOW)))

@@ -2,7 +2,7 @@
 
 Beside nearest neighbour after ICP and pairwise ZoomOut on the same shapes.
 
-The embedded collection, clean and dirty, and 25 registered faces where the shared data are beside
+The sample data, clean and dirty, and 25 registered faces where the shared data are beside
 the checkout.
 """
 
@@ -29,7 +29,7 @@ def embedded(dirty):
     collection = synthetic.brains(12, 40_000, 0, dirty=dirty)
     truth = collection["truth"]
     report(
-        f"embedded collection, {'dirty' if dirty else 'clean'}",
+        f"sample data, {'dirty' if dirty else 'clean'}",
         s4a.analyse(collection, n_jobs=-1),
         lambda shape, template: synthetic.position(
             truth, shape, truth[template]["reference_point"].values

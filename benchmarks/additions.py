@@ -1,4 +1,4 @@
-"""What each deviation from the paper is worth, one at a time and all together, on sets with truth.
+"""Effect of each deviation from the paper, alone and together, on sets with ground truth.
 
 ``additions.py [brains] [faces] [bodies] [--only ROW...] [--data FOLDER] [--write]``: mean distances
 to the truth in % of sqrt(area), of the matched vertices and of the registered surface, and CPU
@@ -42,7 +42,7 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "s4a-benchmarks"
 N_COARSE = 2000
 N_VERTICES = 10_000  # of a shape that is remeshed
-CARRIED = 300  # vertices of the template that are carried over as landmarks
+CARRIED = 300  # vertices of the template that are transferred as landmarks
 
 # ------------------------------------------------------------------------------ what the paper had
 
@@ -284,7 +284,7 @@ def errors(study, image):
 
 
 def carried_error(study, image):
-    """Mean error of vertices of the template that are carried over, both ways where there are."""
+    """Mean error of vertices of the template that are transferred, both ways where there are."""
     registration = study["registration"].to_dataset()
     template = registration.attrs["template"]
     size = np.sqrt(registration["vertex_area"].values.sum())

@@ -48,7 +48,7 @@ def say(text):
 
 
 def icp_motion(source, target):
-    """R, t of ICP on up to 6,000 spread vertices, in the unit of the input."""
+    """R, t of ICP on up to 6,000 samples, in the unit of the input."""
     low = []
     for mesh in (source, target):
         X, T = as_arrays(mesh)
@@ -327,7 +327,7 @@ def points(folder):
 def parcels(folder):
     """35 regions on remeshed faces, bodies and cats, by how far votes count.
 
-    Regions are nearest to spread vertices of the source, along its edges.  The truth on the target
+    Regions are nearest to samples of the source, along its edges.  The truth on the target
     is where it lies on the mesh before it was remeshed, whose vertices are those of the source: its
     borders lie between vertices as distances say (smooth), or around them (by vertex), as those
     that are carried.

@@ -116,7 +116,7 @@ def discretization(given):
 
 
 def transfer(given):
-    """An external template carried to six brains: pair by pair, and through the median (6.2)."""
+    """Transfer an external template to six brains: pair by pair, and through the median (6.2)."""
     tree = synthetic.brains(7, 10_000, 3)
     meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     outside = meshes.pop("brain_07")

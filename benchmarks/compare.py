@@ -103,7 +103,7 @@ def registered_pairs(name, n_pairs, given=None):
 
 
 def embedded_pairs(n_vertices, n_pairs):
-    """The same for the embedded collection, the truth as positions."""
+    """The same for the sample data, the truth as positions."""
     tree = synthetic.brains(n_pairs + 1, n_vertices)
     meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     for (name, source), (other, target) in pairwise(meshes.items()):
@@ -236,7 +236,7 @@ def verdict(found):
         claims |= {
             f"RE-MATCH is the nearest to the truth of the five ({by_error[0]} is)": by_error[0]
             == "RE-MATCH",
-            "our registration is nearer to the truth than all five": error["registered"]
+            "our registration is more accurate than all five": error["registered"]
             < error[by_error[0]],
             "the order by Chamfer distance is the order by the truth": sorted(
                 five, key=of["chamfer"].get
@@ -267,7 +267,7 @@ def figure_3(found):
 
 
 def embedded(n_vertices=20_000, methods=comparison.METHODS):
-    """Five pairs of the embedded collection, with truth."""
+    """Five pairs of the sample data, with truth."""
     tree = synthetic.brains(6, n_vertices)
     meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     (reference, source), *others = meshes.items()
@@ -277,10 +277,7 @@ def embedded(n_vertices=20_000, methods=comparison.METHODS):
     }
     truth = {n: np.asarray(t) for n, t in truth.items()}
     found = s4a.compare(source, dict(others), truth=truth, methods=methods)
-    say(
-        f"\nTable 1 on the embedded collection: 5 pairs of {n_vertices} vertices, "
-        "landmarks as in 4.1\n"
-    )
+    say(f"\nTable 1 on the sample data: 5 pairs of {n_vertices} vertices, landmarks as in 4.1\n")
     table_1(found)
     figure_3(found)
     if set(comparison.METHODS) <= set(methods):

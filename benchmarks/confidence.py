@@ -8,8 +8,8 @@ tenth (0.1 by chance); and in bins of confidence, the share that is right.  Bodi
 their connectivity; nothing here looks at that.
 
 ``confidence.py failures`` registers random pairs of bodies without the search for initial maps, of
-which many end with limbs exchanged, and says how well these are told by their mean confidence, by
-the way there and back, and by registration_error and distortion, which a study looks at, too.
+which many end with limbs exchanged, and says how well these are reported by their mean confidence,
+by the way bidirectional, and by registration_error and distortion, which a study looks at, too.
 """
 
 import subprocess
@@ -30,7 +30,7 @@ from sklearn.metrics import roc_auc_score
 import s4a
 from s4a import synthetic
 from s4a.method import initial_map
-from s4a.method.register import RIGHT, WEIGHTS, evidence
+from s4a.method.register import RADIUS, WEIGHTS, confidence_features
 from s4a.options import Options
 from s4a.study.pair import match_shapes, shape_of
 from s4a.study.quality_control import UNSURE, WRONG
@@ -51,7 +51,7 @@ EACH = 2000  # vertices of a pair in the fit
 FAILING = range(8, 14)  # seeds of pairs
 SIGNS = {  # of a registration; what is high is a sign of failure
     "mean confidence": lambda found: -found["confidence"].values.mean(),
-    "there and back": lambda found: found["round_trip"].values.mean(),
+    "bidirectional": lambda found: found["round_trip"].values.mean(),
     "distortion": lambda found: abs(found["distortion"].values).mean(),
     "registration_error": lambda found: found.attrs["score"],
 }
@@ -100,14 +100,14 @@ def same_vertices(folder, part, pairs):
 
 
 def measured(pair):
-    """Error of every vertex, share of sqrt(area); evidence; the registration."""
+    """Error of every vertex, share of sqrt(area); confidence_features; the registration."""
     options = Options(n_coarse=4000)
     source, target = (shape_of(mesh, options) for mesh in (pair.shape, pair.template))
     found, _ = match_shapes(source, target, options)
     image = image_of(found, pair.template)
     error = np.linalg.norm(image - pair.true, axis=1) / source.frame[1]
-    seen = evidence(source, target, found["registered_match"].values, source.to_frame(image))
-    return error, seen, found
+    match = found["registered_match"].values
+    return error, confidence_features(source, target, match, source.to_frame(image)), found
 
 
 def fit(results):
@@ -117,7 +117,7 @@ def fit(results):
     for error, evidence_of_pair, _ in results:
         some = rng.choice(len(error), EACH)
         seen.append(evidence_of_pair[some])
-        right.append(error[some] < RIGHT)
+        right.append(error[some] < RADIUS)
     model = LogisticRegression(C=1e3, max_iter=1000)
     model.fit(np.concatenate(seen), np.concatenate(right))
     return model.intercept_[0], *model.coef_[0]
@@ -134,12 +134,12 @@ def report(names, results):
     say(f"{'pair':16} {'error %':>8} {'right':>6} {'sure':>6} {'Spearman':>9} {'caught':>7}\n")
     for name, (error, _, found) in zip(names, results, strict=True):
         sure = found["confidence"].values
-        right, rank = (error < RIGHT).mean(), spearmanr(-sure, error)[0]
+        right, rank = (error < RADIUS).mean(), spearmanr(-sure, error)[0]
         cells = f"{100 * error.mean():8.3f} {right:6.2f} {sure.mean():6.2f} {rank:9.2f}"
         say(f"{name:16} {cells} {caught(error, sure):7.2f}\n")
     error = np.concatenate([error for error, *_ in results])
     sure = np.concatenate([found["confidence"].values for *_, found in results])
-    right, bins = error < RIGHT, np.clip((10 * sure).astype(int), 0, 9)
+    right, bins = error < RADIUS, np.clip((10 * sure).astype(int), 0, 9)
     say("confidence in the mean, share that is right, share of the vertices:\n")
     for b in np.unique(bins):
         say(
@@ -150,7 +150,7 @@ def report(names, results):
 
 
 def failures(folder):
-    """Whether a registration that failed is told from those that are right, and by what."""
+    """Whether a registration that failed is reported from those that are right, and by what."""
     errors, signs = [], {name: [] for name in SIGNS}
     with mock.patch.multiple(initial_map, SEARCHED=(), N_PAIRED=0):
         for seed in FAILING:
@@ -163,7 +163,7 @@ def failures(folder):
     errors = np.array(errors)
     signs = {name: np.array(values) for name, values in signs.items()}
     signs["registration_error x distortion"] = signs["registration_error"] * signs["distortion"]
-    signs["there and back x distortion"] = signs["there and back"] * signs["distortion"]
+    signs["bidirectional x distortion"] = signs["bidirectional"] * signs["distortion"]
     failed, right = errors > plausibility.FAILED, errors < plausibility.RIGHT
     sys.stdout.write(
         f"{len(errors)} pairs: {failed.sum()} failed, more than {plausibility.FAILED:.0f} %; "

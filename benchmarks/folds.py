@@ -22,7 +22,7 @@ from s4a import synthetic
 from s4a.method import register
 
 FAR = 0.9  # %: about the width of a fold over a tenth of the surface
-WAYS = {"default": register.TORN, "without": np.inf}
+WAYS = {"default": register.MAX_STRAIN, "without": np.inf}
 
 
 def errors(tree, a, b, match):
@@ -33,7 +33,7 @@ def errors(tree, a, b, match):
     found = {}
     for way, torn in WAYS.items():
         begin = time.process_time()
-        with threadpool_limits(1), mock.patch.object(register, "TORN", torn):
+        with threadpool_limits(1), mock.patch.object(register, "MAX_STRAIN", torn):
             image = image_of(match(a, b), template)
         gap = np.linalg.norm(image - true, axis=1).mean() / np.sqrt(shape.attrs["area"])
         found[way] = 100 * gap, time.process_time() - begin

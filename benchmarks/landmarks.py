@@ -60,7 +60,7 @@ def report(file, other):
 
 
 def distances(template, shape, marks):
-    """Of the landmarks of the template, carried to the shape, to those marked there, in mm."""
+    """Of the landmarks of the template, transferred to the shape, to those marked there, in mm."""
     (X, T), (Y, S) = as_arrays(template), as_arrays(shape)
     there, true = (mark["landmark_position"].values.astype(float) for mark in marks)
     at = interpolate(ours(template, shape, None, "elastic"), T, *closest_point(there, X, T))

@@ -188,7 +188,7 @@ def equal_studies(a, b):
             one, other = one.drop_dims("stage"), other.drop_dims("stage")
         if not one.identical(other):
             differ.append(name)
-    return f"differ: {differ}" if differ else f"{len(names)} files, all the same to the bit"
+    return f"differ: {differ}" if differ else f"{len(names)} files, all the same bit-identical"
 
 
 def one_by_one(study, files):
@@ -247,7 +247,7 @@ def inserts(folder, n, n_vertices):
         say(f"{way.__name__}: {n} inserted, {time.perf_counter() - begin:.0f} s")
     first, *others = ways.values()
     same = all(one == first for one in others)
-    say(f"{len(first)} arrays of {n} shapes: {'the same to the bit' if same else 'THEY DIFFER'}")
+    say(f"{len(first)} arrays of {n} shapes: {'the same bit-identical' if same else 'THEY DIFFER'}")
 
 
 def table(folder):

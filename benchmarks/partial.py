@@ -25,13 +25,13 @@ single shapes.
 
 ``--left-out`` has no new shapes: of the eleven brains of the study beside its template the same
 part is missing, which a plane of random direction cuts off the mean shape, six for each share (two
-with ``--few``), and each is told by the others with the factor and the share of the others.  For
-each cut: the parts of shapes; the share of coordinates where nothing is that lie within intervals
-of 90 % around the truth, and with all of the variance between ways; and the median of cov(p, e) /
-var(e), with p what is told less the match and e the match less the truth, where nothing is, with
-what stands for e in a study, the match less the direct way, and both where the part is.  The planes
-are the same for every seed; of several the two shares are pooled, with the standard error between
-studies.
+with ``--few``), and each is reported by the others with the factor and the share of the others.
+For each cut: the parts of shapes; the share of coordinates where nothing is that lie within
+intervals of 90 % around the truth, and with all of the variance between ways; and the median of
+cov(p, e) / var(e), with p what is reported less the match and e the match less the truth, where
+nothing is, with what stands for e in a study, the match less the direct way, and both where the
+part is.  The planes are the same for every seed; of several the two shares are pooled, with the
+standard error between studies.
 """
 
 import logging
@@ -282,7 +282,7 @@ def rows_of_left_out(found, gaps, wrong):
 
 
 def left_out(store, n_planes, seed):
-    """The table of shapes of a study that are told by the others, and the rows of each share.
+    """The table of shapes of a study that are reported by the others, and the rows of each share.
 
     Rows are those of all shapes with the first plane, then with the second, and so on.
     """

@@ -9,14 +9,14 @@ the non-rigid ICP of Amberg et al. in trimesh with its own and with more steps; 
 
 Faces are registered, vertex i is vertex i; the shape is remeshed so that its vertices say nothing
 of these.  Isotropic remeshing alone keeps some: how many is said above each pair, and ``--kept``
-shows what that is worth to whom.
+shows what that contributes to whom.
 
 Each method runs in a process of its own, which is ended at 900 s of CPU or 16 GiB; then the row
 says so.
 
 The pairs that elastic iterations were tuned on are shown with ``--tuned`` and left out otherwise;
 of cortex templates there is one pair, which was tuned on.  ``--more`` shows pairs that stand in
-neither, among them every other one of the five skulls, without joint iterations and without
+neither, among them every other one of the five skulls, without spectral non-rigid ICP and without
 trimesh, which takes 16 to 19 minutes a skull; at the end the mean of each method over the pairs of
 a set, and on how many it is nearer than S4A.  All but brains need the shared data beside the
 checkout; the others come with the extra ``bench``.
@@ -254,7 +254,7 @@ def amberg(template, shape, start, stiffness=None):
 OURS = "S4A, elastic iterations (default)"
 METHODS = {
     OURS: (ours, "elastic"),
-    "S4A, joint iterations": (ours, "joint"),
+    "S4A, spectral non-rigid ICP": (ours, "joint"),
     "ICP, nearest point": (nearest,),
     "MeshMonk, 80 iterations": (meshmonk, 80),
     "MeshMonk, 80, sqrt(area) 200": (meshmonk, 80, 200.0),

@@ -5,7 +5,8 @@ four, on which the thresholds were chosen, and others. ``plausibility.py [COLLEC
 
 ``plausibility.py registrations [COLLECTION ...]`` registers shapes of known correspondence, one
 template to the others of its collection, once as by default and once from initial maps of 10
-landmarks, which fail in far poses; and counts of which failed registrations a run would tell.
+landmarks, which fail where poses differ a lot; and counts of which failed registrations a run would
+tell.
 
 ``plausibility.py simulated [COLLECTION ...]`` begins one registration at a time at a wrong
 transform, the others of the collection as by default.  Which of them failed the truth alone says:
@@ -151,7 +152,7 @@ def oddities(X, T, others):
 
 
 class Collection:
-    """Portraits of shapes, and what is told with one or some of them replaced."""
+    """Portraits of shapes, and what is reported with one or some of them replaced."""
 
     def __init__(self, shapes):
         self.pairs = {}
@@ -239,7 +240,7 @@ def rows_of(name, shapes, others):
 
 
 def clean_brains():
-    """How many shapes of eight clean collections, of different seeds and modes, are told."""
+    """How many shapes of eight clean collections, of different seeds and modes, are reported."""
     sizes = [(7, 2), (7, 6), (7, 6), (9, 6), (7, 2), (8, 3), (20, 6), (6, 4)]  # shapes, modes
     told = {}
     for seed, (n, n_modes) in enumerate(sizes, 20):
@@ -336,15 +337,15 @@ def turned(signs):
 
 
 def judged(name, at, meshes, shapes):
-    """Of every registration of a collection, by default and simulated: way, error and what is told.
+    """Method, error and flags of each registration of a collection, by default and simulated.
 
-    What is simulated is seen beside the registrations of the others as by default.
+    A simulated failure is compared with the default registrations of the others.
     """
     part = PLANTED_IN[name][0]
     template, *others = [list(shapes)[at], *(n for i, n in enumerate(shapes) if i != at)]
     error, registration_error, distortion = {}, {}, {}
     for way in ("as by default", *TURNS):
-        # an initial map of landmarks, as the dense one is mended by a search
+        # an initial map of landmarks, as the dense one is repaired by a search
         more = {"init": "landmarks"} if way in TURNS else {}
         options = Options(bidirectional=False, n_coarse=3000, **more)
         for other in others:
@@ -428,7 +429,7 @@ def simulated(names):
                         f"registration_error {score:.4f}, |distortion| {size:.4f}: {told or '-'}\n"
                     )
                     sys.stdout.flush()
-    head = "| collection | begun | failed | told | right | told in vain | between |"
+    head = "| collection | begun | failed | told | right | told as false positives | between |"
     sys.stdout.write(f"\n{head}\n{'|---' * 7}|\n")
     for (name, way), of in table.items():
         cells = [name, way, *counts(of)]

@@ -1,4 +1,4 @@
-"""Pairs in far poses, each matched on its own from scratch: errors by the truth.
+"""Pairs where poses differ a lot, each matched on its own from scratch: errors by the truth.
 
 ``poses.py [--seed S] [--pairs N] [--three] [--landmarks N] [--field] [--network]``: random ordered
 pairs of twenty registered bodies of the shared data (two persons in ten poses), 4,000 vertices at

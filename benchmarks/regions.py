@@ -2,9 +2,9 @@
 
 ``python benchmarks/regions.py [RUNS]``: smooth fields on an ellipsoid of 200 vertices, two
 groups of ten that differ in a region of a sixth of the area, or nowhere, and a nuisance that moves
-all.  Error is how often groups are told apart at 0.05, as whole shapes and at any vertex after the
-correction for all, where nothing is; power how often as whole shapes, and the share of the region's
-vertices, in every fifth run.
+all.  Error is how often groups are reported apart at 0.05, as whole shapes and at any vertex after
+the correction for all, where nothing is; power how often as whole shapes, and the share of the
+region's vertices, in every fifth run.
 """
 
 import sys

@@ -1,11 +1,11 @@
-"""A folder of 60 good files and 40 bad ones of 40 kinds: what a run says, and what it is worth.
+"""A folder of 60 good files and 40 bad ones of 40 kinds: what a run says, and its effect.
 
 ``python benchmarks/trial.py [FOLDER]`` writes the files, runs ``s4a run`` over all of them,
 and prints the summary and what became of every bad file.  Then it does what the summary says: bad
 ones that stood in the network, used with a warning or of a registration that failed, are taken
 away.  The results of the good ones are compared bit for bit with those of a run over them alone.
-It exits with 1 where they differ, where a bad file is used and nothing is told of it, or where the
-summary is longer or wider than a screen.
+It exits with 1 where they differ, where a bad file is used and nothing is reported of it, or where
+the summary is longer or wider than a screen.
 """
 
 import contextlib
@@ -149,7 +149,7 @@ def differing(one, other):
 def used_and_told(report, bad):
     """Of the bad shapes that a study uses: name -> kinds of what its report tells, or nothing.
 
-    An odd shape may be an honest outlier: then it is told, and no more.
+    An odd shape may be an honest outlier: then it is reported, and no more.
     """
     of = {name: report.sel(shape=name) for name in bad if name in report["shape"].values}
     used = [name for name, row in of.items() if row["status"].item() in ("ok", "repaired")]
@@ -173,7 +173,7 @@ def main(folder):
     say(f"good ones that are not ok: {', '.join(spoilt) or 'none'}")
     told = used_and_told(report, bad)
     words = [f"{name} ({kinds or 'NOT TOLD'})" for name, kinds in told.items()]
-    say(f"bad ones that are used, and what is told of them: {', '.join(words) or 'none'}")
+    say(f"bad ones that are used, and what is reported of them: {', '.join(words) or 'none'}")
     network = study["network"]["shape"].values
     within = [name for name in bad if name in network]
     say(f"bad ones in the network: {', '.join(within) or 'none'}")

@@ -176,12 +176,12 @@ def list_options():
 def list_tables():
     """What the commands of speed, and those of all pages, printed when each was run last."""
     others = [command for command in paper.commands() if command not in paper.SPEED]
-    for name, head, commands in (("performance", "###", paper.SPEED), ("tables", "##", others)):
+    for name, commands in (("performance", paper.SPEED), ("tables", others)):
         files = [paper.kept(command) for command in commands]
         texts = [path.read_text(encoding="utf-8") for path in files if path.exists()]
         # what a command printed keeps its headings, below that of the command
-        texts = [re.sub("^#(?=#* )", f"{head}#", text, flags=re.MULTILINE) for text in texts]
-        text = "\n".join(text.replace(f"{head}# `", f"{head} `", 1) for text in texts)
+        texts = [re.sub("^#(?=#* )", "###", text, flags=re.MULTILINE) for text in texts]
+        text = "\n".join(text.replace("### `", "## `", 1) for text in texts)
         write(HERE / f"_{name}.md", text)
 
 

@@ -221,9 +221,10 @@ def variance(study):
     registration = study["registration"].to_dataset()
     names = registration["shape"].values.tolist()
     R, t = registration["icp_rotation"].values, registration["icp_translation"].values
+    options = {"refine": "intrinsic", "alignment": "icp"}
     fields = [
-        s4a.register_shape(study, name, start=start, refine="intrinsic", alignment="icp")
-        for name, *start in zip(names, R, t, strict=True)
+        s4a.register_shape(study, name, initial_transform=transform, **options)
+        for name, *transform in zip(names, R, t, strict=True)
     ]
     fields = xr.concat([f[["displacement", "displacement_low"]] for f in fields], "shape")
     area = s4a.geometry.mesh.vertex_areas(*mesh_of(registration))

@@ -500,7 +500,7 @@ EXPECTED: dict[type, str] = {
 }
 
 
-def check_type(value: object, kind: type, what: str = "study", expected: str = "") -> None:
+def check_type(value: object, kind: Any, what: str = "study", expected: str = "") -> None:
     """Raise TypeError unless an argument is of a type; it says what is `expected`.
 
     Examples
@@ -524,7 +524,7 @@ def require(data: xr.Dataset, *names: str, what: str = "dataset") -> None:
     >>> from s4a.schema import dataset, require
     >>> require(dataset(position=[[0.0, 0.0, 1.0]]), "position")
     """
-    check_type(data, xr.Dataset, what)
+    check_type(data, xr.Dataset | xr.DataTree, what, EXPECTED[xr.Dataset])
     missing = [name for name in names if name not in data]
     if missing:
         raise ValueError(

@@ -23,7 +23,7 @@ from s4a.study.pair import match_shapes, shape_of
 log = logging.getLogger(__name__)
 
 ITERATIONS = 5  # of the consensus, and of the involution
-# Mean gap of the involution, of sqrt(area), from which the template is told as asymmetric
+# Mean gap of the involution, of sqrt(area), from which the template is reported as asymmetric
 FAR = 0.05
 
 

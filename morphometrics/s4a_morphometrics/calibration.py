@@ -1,16 +1,16 @@
-"""Calibration (6.1): how sure what is told of a part is, by the same part of other shapes.
+"""Calibration (6.1): how sure what is reported of a part is, by the same part of other shapes.
 
 Two things are measured, and their variances added:
 
-1. How far what is told lies from the match of the whole: the part is cut out of shapes of the
+1. How far what is reported lies from the match of the whole: the part is cut out of shapes of the
    study, matched and completed by all others (:func:`found_again`).
 2. How far that match lies from the truth.  All shapes of a study are matched to one template.
    They are registered onto each other, too, and the way over the template is compared with the
    direct one (:func:`between_ways`).
 
 The first holds some of the second: what the match of a left-out shape gets wrong on its own no
-other shape tells.  With p what is told less the match and e the match less the truth, the variance
-of p + e is
+other shape tells.  With p what is reported less the match and e the match less the truth, the
+variance of p + e is
 
     var(p) + var(e) + 2 cov(p, e),
 
@@ -27,7 +27,7 @@ import xarray as xr
 from s4a.analysis.inputs import registration_of
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
-from s4a.input.plausibility import spread
+from s4a.input.plausibility import evenly_chosen
 from s4a.method.initial_map import transform_onto
 from s4a.method.pca import gram
 from s4a.method.register import from_latent
@@ -59,7 +59,7 @@ class Again(NamedTuple):
 class Errors(NamedTuple):
     """Differences ``error (m, 3)`` from the match of a whole shape, and ``at (m,)`` which vertices.
 
-    ``deviation (m, 3)``, what the distribution of what is told says of them, or 1.
+    ``deviation (m, 3)``, what the distribution of what is reported says of them, or 1.
     """
 
     at: np.ndarray
@@ -101,7 +101,7 @@ def found_again(model: Model, present: np.ndarray, density: float) -> dict[str, 
 
 
 def again_of(found: dict[str, Found], gaps: Gaps) -> Again:
-    """What shapes that were told by the others say of one that is told by all.
+    """What shapes that were told by the others say of one that is reported by all.
 
     Nine tenths of all coordinates lie within the intervals of 90 %, of one variance where the part
     is, and where nothing is of the deviations of the distribution times ``factor``, which errors of
@@ -128,7 +128,7 @@ def _calibrated(found, gaps):
 
 
 def share_to_add(told: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Which share of the variance between two ways is not in the errors of what is told.
+    """Which share of the variance between two ways is not in the errors of what is reported.
 
     With p the errors from the match and g the match less the direct way, the variance of p + g is
     that of p and 1 + 2 (p g) / (g g) times that of g; the median over the shapes, as in
@@ -141,7 +141,7 @@ def share_to_add(told: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
 
     Examples
     --------
-    What is told lies off the match by what that has wrong, and by something else:
+    What is reported lies off the match by what that has wrong, and by something else:
 
     >>> import numpy as np
     >>> from s4a_morphometrics.calibration import share_to_add
@@ -217,7 +217,7 @@ def gaps_between_ways(model: Model) -> Gaps:
 
 def _rematched(registration):
     """Shapes of the study whose part is matched again."""
-    return spread(_others(registration), N_REMATCHED)
+    return evenly_chosen(_others(registration), N_REMATCHED)
 
 
 def _others(registration):
@@ -226,13 +226,13 @@ def _others(registration):
 
 
 def _pairs_of(study):
-    """Some of them, each with the shape that it is registered onto; none that stands apart.
+    """Some of them, each with the shape that it is registered onto; none that is excluded.
 
     None at all where fewer than two stand in the network beside the template.
     """
     registration, network = registration_of(study), study["latent"]["shape"].values.tolist()
     others = [name for name in _others(registration) if name in network]
-    chosen = spread([name for name in _rematched(registration) if name in network], N_WAYS)
+    chosen = evenly_chosen([name for name in _rematched(registration) if name in network], N_WAYS)
     if len(others) < 2:
         return []
     half = len(others) // 2

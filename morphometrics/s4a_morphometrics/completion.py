@@ -103,7 +103,7 @@ def complete(
         coordinate where the part is; where nothing is ``factor`` of what the modes leave, and
         ``added``, the deviation that comes to it of ``between_ways``, that between two ways of
         matching; and ``left_out_error``, the root mean square error of a coordinate with which the
-        study's own shapes are told by the others there; ``warning``.
+        study's own shapes are reported by the others there; ``warning``.
 
     Raises
     ------

@@ -14,8 +14,8 @@ import s4a
 from s4a.input.chirality import (
     COMMON_SIDE,
     OTHER_SIDE,
-    hands,
     is_mirrored,
+    mean_chirality,
     mirrored_shapes,
     rarer_side,
 )
@@ -49,7 +49,7 @@ def find_mirrored(
 def find_mirrored_new(
     given: Mapping[str, tuple[xr.DataTree, dict[str, Any]]],
 ) -> tuple[list[str], list[str]]:
-    """The new subjects of the other hand than those of a study, and what is told of them.
+    """The new subjects of the other side than those of a study, and what is reported of them.
 
     Parameters
     ----------
@@ -75,13 +75,13 @@ def find_mirrored_new(
 
 
 def seen_together(looks: Looks) -> dict[str, xr.Dataset]:
-    """What several structures of each subject say together, for :func:`s4a.input.chirality.hands`.
+    """Combine the chirality of several structures of each subject.
 
     Returns
     -------
     dict of str to Dataset
-        Subject -> ``hand(reference)``, the sum over the n structures that both have, over sqrt(n):
-        their noise is then that of one.  NaN where they have none.
+        Subject -> ``chirality(reference)``, for :func:`s4a.input.chirality.mean_chirality`: the sum
+        over the n structures that both have, over sqrt(n), as noisy as one.  NaN if they have none.
 
     Examples
     --------
@@ -115,14 +115,14 @@ def hand_table(looks: Looks, subjects: list[str], references: list[str]) -> np.n
 
 
 def mirrored_subjects(looks: Looks) -> tuple[dict[str, float], list[str], list[str]]:
-    """The subjects of the rarer hand, each as a whole.
+    """The subjects of the rarer side, each as a whole.
 
     Returns
     -------
     hand : dict of str to float
-        Of every subject, as of :func:`s4a.input.chirality.hands`.
+        Of every subject, as of :func:`s4a.input.chirality.mean_chirality`.
     names : list of str
-        Those of the rarer hand.
+        Those of the rarer side.
     remarks : list of str
         In words, as of :func:`s4a.input.chirality.mirrored_shapes`; and which subjects have
         structures of both hands, and stay as they are: each subject is named once.
@@ -130,7 +130,7 @@ def mirrored_subjects(looks: Looks) -> tuple[dict[str, float], list[str], list[s
     together = seen_together(looks)
     if len(together) < 2:
         return dict.fromkeys(together, np.nan), *mirrored_shapes(together)
-    names, mean = list(together), hands(together)
+    names, mean = list(together), mean_chirality(together)
     hand = dict(zip(names, mean.tolist(), strict=True))
     table = hand_table(looks, names, names) * np.where(mean < 0, -1, 1)
     known = np.isfinite(table)

@@ -174,7 +174,7 @@ def rough_starts(
 
 
 def _anchors(whole, area):
-    """Centres ``(N_ANCHORS, 3)`` of pieces of the whole of that area, round spread vertices."""
+    """Centres ``(N_ANCHORS, 3)`` of pieces of the whole of that area, round samples."""
     weight = vertex_areas(whole.X, whole.T)
     centers = []
     for vertex in farthest_points(whole.X, N_ANCHORS):

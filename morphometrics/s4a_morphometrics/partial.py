@@ -106,7 +106,7 @@ def match(part: Part, model: Model, whole: Whole, fit: Fit) -> tuple[np.ndarray,
 
 
 class Told(NamedTuple):
-    """What is told of a shape at low resolution, in the frame of the template.
+    """What is reported of a shape at low resolution, in the frame of the template.
 
     ``weights`` of the ``columns (p, n_low, 3)``, ``spread (r, n_low, 3)``, the fields that they may
     differ by, independent and of one standard deviation each, and ``image (n_low, 3)``, which goes

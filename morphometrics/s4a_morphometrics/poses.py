@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
 
 LEVELS = ("joint", "between", "within")
 MOST_STEPS, CLOSE = 200, 1e-12  # of the means; until they move by so little of the size
-FAR, LEAST = 6, 0.1  # a pose is told of from so many times the usual, and this much of the size
+FAR, LEAST = 6, 0.1  # a pose is reported of from so many times the usual, and this much of the size
 SAME_CENTRE = 1e-3  # of the size: as if every file was centred
 MOST_RATIO = 300  # of sizes: as if units differed
 
@@ -244,7 +244,7 @@ def structures(
     The shares are of what was registered: noise of the registration is within structures.  Size of
     a structure is within; what all structures share as size of the whole too, unless `scale`.
     Where scans of one subject were moved apart, as when every file is centred, poses are lost and
-    nothing here can know it but where all centres coincide, which is told.
+    nothing here can know it but where all centres coincide, which is reported.
 
     Examples
     --------
@@ -595,7 +595,7 @@ def report_frames(names: list[str], Y: list[np.ndarray], areas: list[np.ndarray]
         if np.linalg.norm(centre[k] - centre[0], axis=1).max() < SAME_CENTRE * size[smallest]:
             log.warning(
                 "%s and %s have the same centre in every subject: were their files centred, so "
-                "that how they lie to each other is lost?",
+                "that how they lie relative to each other is lost?",
                 names[0],
                 names[k],
             )

@@ -115,7 +115,7 @@ def write_slicer(
     n_points : int
         Vertices that are points, as far apart as can be; the same ones on every shape.
     landmarks : Dataset, optional
-        Of the template, by default those of its file; carried to all shapes.
+        Of the template, by default those of its file; transferred to all shapes.
 
     Returns
     -------

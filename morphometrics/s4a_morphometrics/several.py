@@ -80,7 +80,7 @@ def analyse_structures(
         ``marks/left/subject_1.csv``; or, of files with a table, files named as these.
     reflect : str or list of str, optional
         As of :func:`s4a.analyse`, of subjects.  ``"auto"`` takes all structures of a subject
-        together.  All of them are mirrored, so that they lie to each other as before.
+        together.  All of them are mirrored, so that they lie relative to each other as before.
     store : path, optional
         Folder of the study, with one of each structure in ``structures/<name>``.  A run that was
         killed goes on at the first missing file.
@@ -411,7 +411,7 @@ def named_subjects(reflect: str, parts: Mapping[str, Part]) -> list[str]:
             each = [f"{cell!r} ({name})" for name, cell in said.items()]
             raise ValueError(
                 f"reflect={reflect!r}: all structures of a subject are mirrored together, so that "
-                f"they lie to each other as before, and need one value in the column {column!r}; "
+                f"their relative pose is kept, and need one value in the column {column!r}; "
                 f"{subject} has {listed(each)}. Structures of both sides as one kind are a study "
                 "of one structure: s4a.analyse, without the column 'structure'"
             )
@@ -517,7 +517,7 @@ def insert_structures(
 ) -> xr.DataTree:
     """New subjects in the studies of all structures, which stay as they are.
 
-    A structure of which none can be used is told, and costs the others nothing.
+    A structure of which none can be used is reported, and costs the others nothing.
 
     Parameters
     ----------
@@ -528,7 +528,7 @@ def insert_structures(
     landmarks, table : path, optional
         As there.
     reflect : str or list of str, optional
-        New subjects to mirror: names, a column of the table, or ``"auto"``, those of the other hand
+        New subjects to mirror: names, a column of the table, or ``"auto"``, those of the other side
         than the subjects of the study; all structures of a subject are mirrored together.
     compare, n_jobs : see :func:`s4a.insert`
 

@@ -1,4 +1,4 @@
-"""Scalar fields carried to the template, tests of them, and field against shape."""
+"""Scalar fields transferred to the template, tests of them, and field against shape."""
 
 import logging
 import shutil

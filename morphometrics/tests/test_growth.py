@@ -199,6 +199,7 @@ def test_what_is_no_repeated_measure_is_refused_or_told(simulated, caplog):
     assert "allow no p value below 0.5" in caplog.text
 
 
+@pytest.mark.usefixtures("short_films")
 def test_the_command_writes_the_trajectory(study_folder, tmp_path, capsys):
     folder = shutil.copytree(study_folder, tmp_path / "study")
     names = open_study(folder)["registration"]["shape"].values.tolist()

@@ -204,7 +204,7 @@ def test_a_level_is_a_study_for_what_takes_one(tmp_path):
         structures_modes(study, found, "within")
 
 
-# ---- what is told
+# ---- what is reported
 
 
 def far_away(Y):

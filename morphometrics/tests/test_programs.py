@@ -453,7 +453,7 @@ def test_an_error_says_what_was_needed(study, tmp_path, program, options, words)
 def test_programs_that_play_modes_need_some(study, tmp_path, program):
     nodes = {node.path: node.to_dataset(inherit=False) for node in study.subtree}
     del nodes["/pca"]
-    with pytest.raises(ValueError, match="a study with modes is needed"):
+    with pytest.raises(ValueError, match="a study with /pca is needed"):
         write_for(xr.DataTree.from_dict(nodes), tmp_path, program)
 
 

@@ -415,7 +415,7 @@ def looks(hands):
             [1.8, 1.8, -1.8, 0.1],
             [1.8, 1.8, 1.8, 0.1],
             [],
-            ["cannot tell the hand of d, which stayed", "c is of both hands (left -"],
+            ["cannot determine the side of d", "c is of both hands (left -"],
         ),
     ],
 )
@@ -430,4 +430,4 @@ def test_hands_add_up_and_one_subject_alone_is_of_no_hand():
     assert seen_together(both)["a"]["chirality"].values[1] == pytest.approx(2 * 0.81 / np.sqrt(2))
     hand, names, told = mirrored_subjects({"left": {}, "right": {}})
     assert (hand, names) == ({}, [])
-    assert "needs two shapes or more" in told[0]
+    assert "needs at least two shapes" in told[0]

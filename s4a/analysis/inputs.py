@@ -287,7 +287,7 @@ def _kind(values):
 
 
 def _column(study, name, what):
-    """A column of ``/subjects``, by the shapes."""
+    """Return a column of ``/subjects`` by shape; the value of a shape without a row is missing."""
     table = study["subjects"].to_dataset() if "subjects" in study.children else xr.Dataset()
     if name not in table:
         raise ValueError(
@@ -295,7 +295,9 @@ def _column(study, name, what):
             f"{', '.join(map(str, table.data_vars)) or 'none'}; "
             "give a table, or the values themselves"
         )
-    return dict(zip(table["shape"].values.tolist(), table[name].values.tolist(), strict=True))
+    everyone = all_registered(study)["shape"].values.tolist()
+    known = dict(zip(table["shape"].values.tolist(), table[name].values.tolist(), strict=True))
+    return {shape: known.get(shape) for shape in everyone}
 
 
 def is_unknown(values: np.ndarray) -> np.ndarray:

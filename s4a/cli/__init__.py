@@ -8,7 +8,6 @@ import argparse
 import difflib
 import io
 import logging
-import os
 import re
 import sys
 import textwrap
@@ -22,7 +21,7 @@ from s4a.extensions import extensions
 
 __all__ = ["Command", "add_options", "command", "main", "number_or_name", "parser", "whole"]
 
-PAGE = "https://github.com/OWNER/s4a/blob/HEAD/docs/research.md"
+PAGE = "https://github.com/OWNER/s4a/blob/HEAD/docs/commands.md"
 
 
 class Parser(argparse.ArgumentParser):
@@ -93,8 +92,13 @@ def parser(only: str | None = None) -> Parser:
         sub = subparsers.add_parser(name, help=line, description=text, usage=f"s4a {name}")
         if only in (None, name):
             one.flags(sub)
-            sub("-v", "--verbose", action="store_true", help="log every stage")
-            sub("-q", "--quiet", action="store_true", help="no progress bars, no warnings")
+            sub(
+                "-v",
+                "--verbose",
+                action="store_true",
+                help="a line for each stage in place of a progress bar",
+            )
+            sub("-q", "--quiet", action="store_true", help="no progress bar and no warnings")
             sub.usage = f"{sub.usage} [options]"
             examples = textwrap.indent(f"{one.examples}\n", "  ") if one.examples else ""
             sub.epilog = f"examples:\n{examples}\n" * bool(examples) + f"documentation: {PAGE}"
@@ -150,20 +154,18 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser(name).parse_args(words, argparse.Namespace(words=words))
     if name == "doctor":  # it also runs if packages are missing
         return args.function(args)
-    if args.quiet:
-        os.environ["TQDM_DISABLE"] = "1"
     from s4a.input.raw import shown
     from s4a.study.runner import StageError
 
-    stages, package = logging.getLogger("s4a.study.runner"), logging.getLogger("s4a")
-    levels = stages.level, package.level
+    stages = logging.getLogger("s4a.study.runner")
+    before = stages.level
     filters = [(handler, Once()) for handler in logging.getLogger().handlers]
     for handler, once in filters:
         handler.addFilter(once)
     try:
-        if args.quiet or args.verbose:
-            package.setLevel(logging.ERROR if args.quiet else logging.INFO)
-        elif not sys.stderr.isatty():  # a line for each stage in place of progress bars
+        if args.quiet:
+            logging.disable(logging.WARNING)
+        elif args.verbose or not sys.stderr.isatty():  # a line for each stage, no progress bar
             stages.setLevel(logging.INFO)
         if isinstance(sys.stdout, io.TextIOWrapper):  # letters that the terminal cannot show
             sys.stdout.reconfigure(errors="backslashreplace")
@@ -178,7 +180,7 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stderr.write("s4a: interrupted; the same command resumes where it stopped\n")
         return 130
     finally:
-        stages.setLevel(levels[0])
-        package.setLevel(levels[1])
+        logging.disable(logging.NOTSET)
+        stages.setLevel(before)
         for handler, once in filters:
             handler.removeFilter(once)

@@ -124,5 +124,5 @@ def accuracy(
     return xr.Dataset(
         {"error": (("algorithm", "shape"), both[0], note)}
         | {"geodesic_error": (("algorithm", "shape"), both[1], note)},
-        {"way": [ICP, ZOOMOUT, MATCH, SURFACE], "shape": names},
+        {"algorithm": [ICP, ZOOMOUT, MATCH, SURFACE], "shape": names},
     )

@@ -302,7 +302,7 @@ class Pair:
                 landmarks = clock("map", landmarks_after_alignment, M.low.X, N.low.X, transform)
             else:
                 landmarks = at_low_resolution(M, N, landmarks)
-            ends = M.low.first(k_init), N.low.first(k_init)
+            ends = M.low.truncated(k_init), N.low.truncated(k_init)
             C = clock("map", fmap.fmap_from_landmarks, *ends, *landmarks)
         else:
             C = clock("map", fit_map, M, N, landmarks, k_init)

@@ -25,7 +25,7 @@ def as_landmarks(landmarks: xr.Dataset | Path | str) -> xr.Dataset:
     if isinstance(landmarks, str | Path):
         return read_landmarks(landmarks)
     read = "a landmark file, or what s4a.input.annotations.read_landmarks returns"
-    check_type(landmarks, xr.Dataset, "landmarks", read)
+    check_type(landmarks, xr.Dataset | xr.DataTree, "landmarks", read)
     require(landmarks, "landmark_name", "landmark_position", what="landmarks")
     return landmarks
 

@@ -57,7 +57,8 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
     ----------
     path : path
         CSV with a header, separated by commas, semicolons or tabs, a row per shape; the column
-        ``shape`` has the name of the shape, or its file with or without folders.
+        ``shape`` has the name of the shape, or its file with or without folders.  A row without
+        a shape is ignored; all values of a shape without a row are missing.  A warning names both.
     names : list of str
         The shapes.
 
@@ -74,8 +75,8 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
     Raises
     ------
     ValueError
-        When the file is no such table, or has not one row for each shape; shapes and columns are
-        named.
+        When the file is not such a table, has two rows for a shape, or none for all; shapes and
+        columns are named.
 
     Examples
     --------
@@ -118,14 +119,17 @@ def read_cells(path: Path | str, names: Sequence[str]) -> dict[str, dict[str, st
         del row_of[name]["shape"]
     unknown = [name for name in row_of if name not in names]
     missing = [name for name in names if name not in row_of]
-    if unknown or missing:
-        said = [f"no shape is called {', '.join(map(repr, unknown))}"] if unknown else []
-        said += [f"no row for {', '.join(missing)}"] if missing else []
+    if len(missing) == len(names):
         raise ValueError(
-            f"{path}: a row for every shape and no other needed in the column 'shape'; "
-            + "; ".join(said)
+            f"{path}: names of the shapes ({listed(names)}) needed in the column 'shape'; found "
+            f"{listed(unknown) or 'no row'}"
         )
-    return row_of
+    if unknown:
+        log.warning("%s: rows ignored, as no shape has their name: %s", path, listed(unknown))
+    if missing:
+        log.warning("%s: no row, so all values are missing: %s", path, listed(missing))
+    empty = {column: "" for column in head if column != "shape"}
+    return {name: row_of.get(name, empty) for name in names}
 
 
 def _values(cells):

@@ -17,11 +17,10 @@ from s4a.schema import Array
 
 
 def smoother(Phi: Array, area: Array, U: sp.spmatrix | None = None) -> Callable[..., Any]:
-    """The A-orthogonal projection d -> B (B^T A B)^-1 B^T A d, B = U Phi.
+    """Return the A-orthogonal projection d -> (B^T A B)^-1 B^T A d onto B = U Phi.
 
-    The paper's U Phi (U Phi)^+ d, weighted by area.  At full resolution B is not orthonormal:
-    projecting as if it were loses detail.  B itself is never formed, as B^T A B =
-    Phi^T (U^T A U) Phi with a sparse matrix in the middle.
+    The paper's (U Phi)^+ d, weighted by area.  At full resolution B is not orthonormal, and B^T A d
+    would lose detail.  B is never formed: B^T A B = Phi^T (U^T A U) Phi with a sparse U^T A U.
 
     Parameters
     ----------
@@ -35,7 +34,7 @@ def smoother(Phi: Array, area: Array, U: sp.spmatrix | None = None) -> Callable[
     Returns
     -------
     callable
-        Takes a field (n, 3), gives its coefficients (k, 3).
+        Maps a field (n, 3) to its coefficients (k, 3).
     """
     A = sp.diags_array(area)
     weighted = A if U is None else A @ U  # (n, n_coarse)
@@ -55,22 +54,22 @@ def onto(
     coefficients: Callable[..., Any],
     spectrum: tuple[Array | sp.spmatrix, Array, Array] | None = None,
 ) -> tuple[Array, Array, Array]:
-    """The transform that brings X onto its image, and the displacement that it leaves, smoothed.
+    """Fit a rigid transform of X to its image, and smooth the residual displacement.
 
     Parameters
     ----------
     X, image : float ndarray (n, 3)
     area : float ndarray (n,)
     coefficients : callable
-        Of a field (n, 3), as of :func:`smoother`.
+        Projection of a field (n, 3), see :func:`smoother`.
     spectrum : tuple (mass, Phi, eigenvalue), optional
-        Where it is given, the transform is not one but that of :func:`rigid_parts`.
+        If given, the transform is that of :func:`rigid_parts` at every vertex.
 
     Returns
     -------
     R, t : rotation (3, 3) and translation (3,), or (n, 3, 3) and (n, 3) of the parts
     c : float ndarray (k, 3)
-        So that R x + t + B c is the registered shape.
+        Coefficients; R x + t + B c is the registered shape.
     """
     if spectrum is None:
         R, t, _ = rigid_transform(X, image, area)
@@ -86,24 +85,22 @@ def rigid_parts(
     Phi: Array,
     eigenvalue: Array,
     *,
-    spread: float = 3.0,
+    time: float = 3.0,
 ) -> tuple[Array, Array]:
-    """For every vertex the transform that brings its surroundings closest to their image.
+    """Fit a rigid transform around every vertex: a smooth, piecewise rigid transform.
 
-    :func:`s4a.geometry.align.rigid_transform` at every vertex, all others weighted by the heat
-    kernel around it: eq. 8 and the line after it move what K functions cannot express, such as
-    fingers, with the whole; here they turn with the arm.
+    :func:`s4a.geometry.align.rigid_transform` with weights of the heat kernel around the vertex.
+    Details that K functions cannot express, such as fingers, then rotate with the arm.
 
     Parameters
     ----------
     X, image : float ndarray (n, 3)
     mass : float ndarray (n,), of sum 1, or sparse matrix (n, n)
-        What Phi is orthonormal in.
+        Mass matrix in which Phi is orthonormal.
     Phi, eigenvalue : float ndarray (n, K), (K,)
-        Orthonormal eigenfunctions.  Where all eigenvalues are 0, each piece of a surface moves as a
-        whole.
-    spread : float
-        Time of the heat kernel, by the inverse of the last eigenvalue.
+        Orthonormal eigenfunctions.  If all eigenvalues are 0, each component moves rigidly.
+    time : float
+        Time of the heat kernel, times the last eigenvalue.
 
     Returns
     -------
@@ -112,7 +109,7 @@ def rigid_parts(
         The transforms R x + t.
     """
     largest = max(eigenvalue[-1], np.finfo(float).tiny)
-    heat = np.exp(-spread * eigenvalue / largest)[:, None]  # (K, 1)
+    heat = np.exp(-time * eigenvalue / largest)[:, None]  # (K, 1)
 
     def around(f):
         """Mean of a function around every vertex, weighted by the heat kernel."""
@@ -131,12 +128,10 @@ def rigid_parts(
 def displacement_in_template(
     X: Array, registered: Array, area: Array, *, scale: bool = False
 ) -> tuple[Array, Array, Array, float]:
-    """Displacement of the template (eq. 8), in the template's frame.
+    """Return the displacement of the template (eq. 8) after rigid alignment of the shape.
 
-    Image minus template: the paper's with the other sign, so that template + displacement is the
+    Image minus template, the opposite sign of the paper, so that template + displacement is the
     shape.
-
-    The shape is moved rigidly onto the template before.
 
     Parameters
     ----------
@@ -147,47 +142,49 @@ def displacement_in_template(
     area : float ndarray (n,)
         Template vertex areas.
     scale : bool
-        Whether the shapes' size is taken out as well.
+        Whether to remove size.
 
     Returns
     -------
     displacement : float ndarray (n, 3)
-    R, t, s : the transform s R x + t from the shape's frame to the template's
+        In the frame of the template.
+    R, t, s : the transform s R x + t from the frame of the shape to that of the template
     """
     R, t, s = rigid_transform(registered, X, area, scale=scale)
     return s * registered @ R.T + t - X, R, t, s
 
 
 def normal_displacement(displacement: Array, normals: Array) -> Array:
-    """Signed displacement along the outward normals ``(..., n)``: positive is expansion.
-
-    That is blue in Fig. 4.
-    """
+    """Return displacements along outward normals ``(..., n)``; positive (blue) is expansion."""
     return np.einsum("...nx,nx->...n", displacement, normals)
 
 
 def distortion(X: Array, image: Array, T: Array) -> tuple[Array, Array]:
-    """Conformal and area distortion of every triangle that a map carries.
+    """Return the conformal and area distortion of every triangle under a map.
 
-    With s1 >= s2 the singular values of the linear map of a triangle: log(s1 / s2), 0 where angles
-    are kept, and log(s1 s2), 0 where the area is kept, positive where it grows.  They see torn,
-    sheared and collapsed triangles. They cannot see where a triangle goes or whether it is turned
-    over, and a true map between different shapes has distortion, too.
+    With s1 >= s2 the singular values of the linear map of a triangle: log(s1 / s2), 0 if angles are
+    preserved, and log(s1 s2), 0 if area is preserved, positive if it grows.  They see stretched,
+    sheared and collapsed triangles.  They cannot see a wrong position or a flipped triangle, and
+    correct maps between different shapes have distortion, too.
 
     Parameters
     ----------
     X : float ndarray (n, 3)
         Vertices.
     image : float ndarray (n, 3)
-        Where the map takes them.
+        Images of the vertices.
     T : int ndarray (m, 3)
 
     Returns
     -------
     conformal : float ndarray (m,)
-        Infinite where the image is a line or a point.
+        Infinite if the image is degenerate.
     area : float ndarray (m,)
-        Minus infinity there.  NaN, both, for triangles without an area of their own.
+        Minus infinity if the image is degenerate.  Both are NaN for degenerate triangles.
+
+    See Also
+    --------
+    s4a.method.register.stretch : Both distortions in one number per vertex.
 
     Examples
     --------
@@ -206,8 +203,7 @@ def distortion(X: Array, image: Array, T: Array) -> tuple[Array, Array]:
     G, H = gram(X), gram(image)
     before, after = 2 * triangle_areas(X, T), 2 * triangle_areas(image, T)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # trace(G^-1 H) = s1^2 + s2^2 and det = (s1 s2)^2,
-        # so that their ratio is 2 cosh(log(s1 / s2))
+        # trace(G^-1 H) = s1^2 + s2^2 and det = (s1 s2)^2: their ratio is 2 cosh(log(s1 / s2))
         trace = (
             G[:, 1, 1] * H[:, 0, 0] + G[:, 0, 0] * H[:, 1, 1] - 2 * G[:, 0, 1] * H[:, 0, 1]
         ) / before**2

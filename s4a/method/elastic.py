@@ -1,39 +1,36 @@
-"""Elastic registration: the smoothing of the displacement (4.2, eq. 8) with a price on bending.
+"""Elastic registration: smoothing of the displacement (4.2, eq. 8) with a bending penalty.
 
-The paper cuts a displacement off after K eigenfunctions of the template N; within these every
-tangential shift costs nothing, so that iterations of nearest neighbours drift along the surface.
-Here the coefficients c (K, 3) and a linear map A x + b of what the first iterations left minimise
+The paper truncates a displacement after K eigenfunctions of the template N.  Tangential shifts
+within these cost nothing, so iterations of nearest neighbours drift along the surface.  Here the
+coefficients c (K, 3) and a linear map A x + b of the initially aligned template minimise
 
     sum_i a_i |z_i - y_i|^2_i + stiffness * sum_k lambda_k^2 |c_k|^2,   z = A x + b + Phi c,
 
 where y_i is the point of the shape's surface M that is nearest to z_i in position and normal,
 a_i the vertex area, lambda_k an eigenvalue.  |d|^2_i = (m_i . d)^2 + slide (|d|^2 - (m_i . d)^2)
 along the mean m_i of both normals: vertices may slide, as in the point-to-plane distance of Chen
-and Medioni (1992), with the normals of both surfaces as of Rusinkiewicz (2019).  The second term is
-the bending energy, the integral of |Laplacian|^2 of the displacement.  The stiffness falls from
-round to round, as in the non-rigid ICP of Amberg, Romdhani and Vetter (CVPR 2007), and on where the
-bending energy has settled: there the template follows the shape, and what the price shrinks is the
-displacement alone.  Where each step bends it more, it would follow noise.  Before all that each
-start is made so stiff that near starts meet, and their mean goes on
-(:func:`converging_initialisations`). Lengths are for surfaces of unit area.
+and Medioni (1992), with the normals of both surfaces as in Rusinkiewicz (2019).  The second term is
+the bending energy, the integral of |Laplacian|^2 of the displacement.  The stiffness decreases from
+step to step, as in the non-rigid ICP of Amberg, Romdhani and Vetter (CVPR 2007), and further if the
+bending energy has converged: then the template follows the shape.  If the energy still grows, less
+stiffness would fit noise.  First, very stiff iterations merge similar initialisations into their
+mean (:func:`converging_initialisations`).  Lengths are for surfaces of unit area.
 
-Nothing above keeps a surface from shifting along itself over its own boundary.  Where both
-boundaries lie on each other already they are taken for one line, and the squared distances from it
-across the boundary and along the surface, times its length, are added from the third step on.
+These terms do not keep a surface from sliding over its own boundary.  If both boundaries coincide
+after two steps, squared distances between them, across the boundary and within the surface, are
+added with the boundary's length as weight.
 
-Landmarks that a user marked on both surfaces add their squared distances, each by the same weight.
-Fields that a user gives on both, such as sulcal depth, count beside position and normal in what is
-nearest.
+Landmarks marked on both surfaces add their squared distances, with equal weights.  Fields given on
+both surfaces, such as sulcal depth, enter the nearest-neighbour search next to position and normal.
 
-What K functions cannot follow is left to local iterations: a displacement d (n, 3) of the vertices
-of low resolution, beyond the warp, that minimises
+Local iterations then fit what K functions cannot: a displacement d (n, 3) of the low-resolution
+vertices, in addition to the warp, that minimises
 
     sum_i a_i |d_i - r_i|^2 + time * integral |grad d|^2,
 
-r_i what d_i and the way to the nearest point add up to, the way along the surface counted by half.
-That is one implicit step of heat diffusion, (A + time W) d = A r; the time falls, as that of the
-smoothing in MeshMonk does (White et al., Scientific Reports 2019).  Landmarks add their squared
-distances here, too.
+where r_i is d_i plus the vector to the nearest point, whose tangential part counts half.  That is
+one implicit step of heat diffusion, (A + time W) d = A r.  The time decreases, as in the smoothing
+of MeshMonk (White et al., Scientific Reports 2019).  Landmarks add their squared distances.
 """
 
 from typing import Any, NamedTuple
@@ -46,40 +43,40 @@ from scipy.spatial import cKDTree
 from s4a.geometry.closest import closest_point_in_star, features, interpolate
 from s4a.method.shape import Basis, common_fields, field_columns
 from s4a.method.spectral import Diffusion
-from s4a.method.spectral_icp import Warp, move, turn
+from s4a.method.spectral_icp import Warp, apply_transform, move
 from s4a.schema import Array
 
 _N_STEPS = 8
-_N_FURTHER = 5  # steps at most, where the last was nearly in vain
-# Of each step: from 1e-4 to 1e-7 by equal factors, and on.  Chosen on a pair of faces, of brains
-# and of skulls and two cortex templates, reported on others: docs/decisions.md
+_N_FURTHER = 5  # at most so many more steps, while the bending energy has converged
+# of each step, from 1e-4 to 1e-7 by equal factors, and further.  Tuned on pairs of faces, brains,
+# skulls and cortex templates, reported on others: docs/decisions.md
 STIFFNESS = 1e-4 * 1e-3 ** (np.arange(_N_STEPS + _N_FURTHER) / (_N_STEPS - 1))
-# Of the first two steps, in which different starts meet, and of the others, in which vertices must
-# not drift along the surface any more
+# tangential weight in the first two steps, in which initialisations converge, and in the others, in
+# which vertices must not drift along the surface
 SLIDE = (0.01, 0.1)
-_SETTLED = 1.2  # as long as a step lets the bending energy grow by less than that factor
-BOUNDARY_WEIGHT = 0.01  # share of sqrt(area): of distances at the boundary, by its length
-_BOUNDARY_NEAR = 0.03  # share of sqrt(area): boundaries that are farther apart may be cut anywhere
-_LANDMARK_WEIGHT = 1e-3  # of each landmark: as much as this share of the area
-MEET = 0.01  # share of sqrt(area): starts that end nearer to each other than that go on as one
-_TIME = (2e-2, 2e-4)  # of local iterations: smooth over 0.2, then over 0.02 of sqrt(area)
+_MAX_GROWTH = 1.2  # factor of growth of the bending energy below which it has converged
+BOUNDARY_WEIGHT = 0.01  # share of sqrt(area): weight of boundary distances, times the length
+_MAX_BOUNDARY_DISTANCE = 0.03  # share of sqrt(area): more distant boundaries do not correspond
+_LANDMARK_WEIGHT = 1e-3  # of each landmark, as a share of the area
+MERGE_DISTANCE = 0.01  # share of sqrt(area): initialisations that end closer are merged
+_TIME = (2e-2, 2e-4)  # of local iterations: smooths over 0.2, finally over 0.02 of sqrt(area)
 _LOCAL_SLIDE = 0.5
 _N_LOCAL_ITERATIONS = 10
 
 
 class Schedule(NamedTuple):
-    """How stiff the steps of elastic iterations are, and how long each of them lasts."""
+    """Stiffness and termination of the steps of elastic iterations."""
 
-    stiffness: Array  # (steps,), of each step
-    further: int  # so many, the last ones, only while the bending energy has not settled
+    stiffness: Array  # (steps,)
+    further: int  # number of final steps that need a converged bending energy
     iterations: int  # of a step, at most
-    still: float  # share of sqrt(area): a step ends with a round that moves less
+    tolerance: float  # share of sqrt(area): a step ends if an iteration moves vertices less
 
 
-FOLLOWING = Schedule(STIFFNESS, _N_FURTHER, 8, 1e-3)
-# Before, from each start: so stiff that starts meet.  Chosen on heads 2 to 10, with nothing left to
-# report on but other collections
-MEETING = Schedule(np.array([1e-2, 1e-3]), 0, 32, 1e-4)
+DEFORMATION = Schedule(STIFFNESS, _N_FURTHER, 8, 1e-3)
+# stiff enough for initialisations to converge.  Tuned on heads 2 to 10, reported on other
+# collections
+CONVERGENCE = Schedule(np.array([1e-2, 1e-3]), 0, 32, 1e-4)
 Rows = Array | slice
 _ALL = slice(None)
 
@@ -87,19 +84,18 @@ _ALL = slice(None)
 def nearest_on_surface(
     source: Basis, X: Array, normals: Array, target: Basis | None = None, vertices: Rows = _ALL
 ) -> tuple[Array, Array]:
-    """The points of the source's surface nearest to rows of X in position and normal.
+    """Return the points of the source nearest to rows of X in position, normal and common fields.
 
-    And in the fields that guide both. Unlike nearest vertices they do not crowd where the source is
-    finely meshed.
+    Points on the surface, unlike vertices, do not cluster in finely meshed regions.
 
     Parameters
     ----------
     source : Basis
     X, normals : float ndarray (n, 3)
     target : Basis, optional
-        The surface whose n vertices these are, which may have fields.
+        Surface of these n vertices, which may have fields.
     vertices : int ndarray (n,), optional
-        Which of its vertices; all by default.
+        Indices of the vertices; all by default.
 
     Returns
     -------
@@ -119,15 +115,13 @@ def nearest_on_surface(
     return points, unit(normals)
 
 
-def _points_ahead(source, target, X, vertices=_ALL):
-    """Where the target's vertices at X are drawn, and the directions across both surfaces there.
-
-    All n of them, or some.
+def _attraction(source, target, X, vertices=_ALL):
+    """Points to which some of the target's vertices at X are attracted, and normals there.
 
     Returns
     -------
     y : float ndarray (n, 3)
-        Of :func:`nearest_on_surface`.
+        Points of :func:`nearest_on_surface`.
     m : float ndarray (n, 3)
         Unit mean of the normals of both surfaces.
     """
@@ -137,28 +131,29 @@ def _points_ahead(source, target, X, vertices=_ALL):
 
 
 class Landmarks(NamedTuple):
-    """Landmarks that a user marked on both surfaces."""
+    """Landmarks marked on both surfaces."""
 
-    on_target: Basis  # as a surface of no triangles: X (l, 3), and U (l, n) to its low resolution
+    on_target: Basis  # as a surface without triangles: X (l, 3), and U (l, n) to low resolution
     y: Array  # (l, 3), on the source
 
 
-def boundary_ahead(
+def boundary_attraction(
     source: Basis, target: Basis, X: Array
 ) -> tuple[Array, Array, Array, Array] | None:
-    """Where the target's boundary, its vertices at X, is drawn, if both boundaries are one line.
+    """Return points to which the boundary of the target is attracted, or None.
 
-    They are where nine tenths of the vertices of each lie within ``_BOUNDARY_NEAR`` of the other.
-    Scans may end anywhere, and holes are of one shape alone: such boundaries are left as they are.
+    Boundaries correspond if nine tenths of the vertices of each lie within
+    ``_MAX_BOUNDARY_DISTANCE`` of the other.  Arbitrary ends of scans, and holes of one shape, do
+    not.
 
     Returns
     -------
     vertex : int ndarray (r,)
-        Boundary vertices near the source's boundary.
+        Boundary vertices close to the boundary of the source.
     length : float ndarray (r,)
-        Of the boundary around each: half its two edges.
+        Length of the boundary around each vertex: half of its two edges.
     across : float ndarray (r, 3)
-        Unit vectors along the surface and across its boundary.
+        Unit vectors in the surface, perpendicular to its boundary.
     y : float ndarray (r, 3)
         The nearest vertices of the source's boundary.
     """
@@ -166,23 +161,23 @@ def boundary_ahead(
         return None
     start, end = target.boundary.T
     vertex = np.unique(target.boundary)
-    gap, nearest = source.boundary_tree.query(X[vertex])
+    distance, nearest = source.boundary_tree.query(X[vertex])
     back = cKDTree(X[vertex]).query(source.boundary_tree.data)[0]
-    if max(np.quantile(gap, 0.9), np.quantile(back, 0.9)) > _BOUNDARY_NEAR:
+    if max(np.quantile(distance, 0.9), np.quantile(back, 0.9)) > _MAX_BOUNDARY_DISTANCE:
         return None
     step = X[end] - X[start]
     tangent, length = np.zeros_like(X), np.zeros(len(X))
     for corner in (start, end):
         np.add.at(tangent, corner, step)
         np.add.at(length, corner, np.linalg.norm(step, axis=1) / 2)
-    near = gap < _BOUNDARY_NEAR
+    near = distance < _MAX_BOUNDARY_DISTANCE
     vertex, nearest = vertex[near], nearest[near]
     across = unit(np.cross(unit(tangent[vertex]), target.normals_at(X)[vertex]))
     return vertex, length[vertex], across, source.boundary_tree.data[nearest]
 
 
 def unit(vectors: Array) -> Array:
-    """Vectors ``(n, 3)`` of length 1; those of length 0 stay."""
+    """Normalise vectors ``(n, 3)`` to length 1; zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length == 0, 1, length)
 
@@ -192,9 +187,9 @@ def normal_equations(
 ) -> tuple[Array, Array]:
     """Matrix ``(3 q, 3 q)`` and right side ``(3 q,)`` of the first term, for z = E w, w ``(q, 3)``.
 
-    With W_i = slide I + (1 - slide) m_i m_i^T it is sum_i a_i (z_i - y_i)^T W_i (z_i - y_i); the
-    unknowns are the columns of w, one after the other.  The product of the matrix is in single
-    precision: half the time, and its rounding is 1e-5 of what `slide` adds.
+    With W_i = slide I + (1 - slide) m_i m_i^T the term is sum_i a_i (z_i - y_i)^T W_i (z_i - y_i).
+    The unknowns are the stacked columns of w.  The matrix product is in single precision, which
+    takes half the time and rounds to 1e-5 of what `slide` adds.
 
     Parameters
     ----------
@@ -205,10 +200,10 @@ def normal_equations(
     y : float ndarray (n, 3)
     slide : float
     mass : float ndarray (q, q), optional
-        E^T diag(area) E, where it is known.
+        E^T diag(area) E, if already computed.
     """
     n, q = E.shape
-    # distances across the surface are those of one field: m_i^T z_i, in the 3 q unknowns
+    # normal distances are those of one field: m_i^T z_i, in the 3 q unknowns
     weight = (np.sqrt((1 - slide) * area)[:, None] * m).astype(np.float32)
     across = (weight[:, :, None] * E.astype(np.float32)[:, None]).reshape(n, 3 * q)
     matrix = (across.T @ across).astype(float)
@@ -221,130 +216,131 @@ def normal_equations(
     return matrix, right.T.ravel()
 
 
-def _sampled_area(target, spread):
-    """The area ``(s,)`` of the vertices nearest to each of some that are spread over a surface."""
-    nearest = cKDTree(target.X[spread]).query(target.X)[1]
-    return np.bincount(nearest, target.area, len(spread))
+def _sampled_area(target, samples):
+    """Area ``(s,)`` of the vertices nearest to each of some samples of a surface."""
+    nearest = cKDTree(target.X[samples]).query(target.X)[1]
+    return np.bincount(nearest, target.area, len(samples))
 
 
-def _unmixed(E, area):
-    """B ``(q, q)`` for which E B has the vertices at the start without their smooth part.
+def _decorrelation(E, area):
+    """B ``(q, q)`` such that E B has the initial positions orthogonal to the smooth functions.
 
-    Smooth functions and the start, three columns of E before its last, nearly depend on each other,
-    and exactly on a sphere, which costs the equations of E half their digits; not those of E B.
+    Smooth functions and initial positions, three columns of E before the last, are nearly linearly
+    dependent, on a sphere exactly.  The equations of E lose half their digits, those of E B do not.
     """
     B = np.eye(E.shape[1])
-    smooth, start = E[:, :-4], E[:, -4:-1]
+    smooth, initial = E[:, :-4], E[:, -4:-1]
     weighted = area[:, None] * smooth
-    B[:-4, -4:-1] = -np.linalg.solve(weighted.T @ smooth, weighted.T @ start)
+    B[:-4, -4:-1] = -np.linalg.solve(weighted.T @ smooth, weighted.T @ initial)
     return B
 
 
-def pins(
+def landmark_equations(
     landmarks: Landmarks | None, smooth: Array, R: Array, t: Array
 ) -> tuple[Array, Array, Array]:
-    """E ``(l, q)``, weight and goal of landmarks, which count in all directions alike."""
+    """Return E ``(l, q)``, weight and goal of landmarks, which are isotropic."""
     if landmarks is None:
         return np.zeros((0, smooth.shape[1] + 4)), np.zeros(0), np.zeros((0, 3))
-    at, y = landmarks
-    start = turn(at, R, t)  # (l, 3)
-    E = np.concatenate([at.U @ smooth, start, np.ones((len(y), 1))], axis=1)
+    on_target, y = landmarks
+    initial = apply_transform(on_target, R, t)  # (l, 3)
+    E = np.concatenate([on_target.U @ smooth, initial, np.ones((len(y), 1))], axis=1)
     return E, np.full(len(y), _LANDMARK_WEIGHT), y
 
 
-def step_of(matrix: Array, right: Array) -> Array:
-    """The solution of normal equations ``(q, q)``, ``(q,)``.
+def solve_normal_equations(matrix: Array, right: Array) -> Array:
+    """Solve normal equations ``(q, q)``, ``(q,)``.
 
-    Where a surface has collapsed, single precision can leave a direction of which no point tells
-    with less than nothing. Then those below 1e-10 of the largest eigenvalue are not taken.
+    If a surface has collapsed, single precision can leave a negative eigenvalue.  Then eigenvalues
+    below 1e-10 of the largest are truncated.
     """
     try:
         return scipy.linalg.solve(matrix, right, assume_a="pos")
     except np.linalg.LinAlgError:
         eigenvalue, Q = scipy.linalg.eigh(matrix)
-        told = eigenvalue > 1e-10 * eigenvalue[-1]
-        return Q[:, told] @ (Q[:, told].T @ right / eigenvalue[told])
+        positive = eigenvalue > 1e-10 * eigenvalue[-1]
+        return Q[:, positive] @ (Q[:, positive].T @ right / eigenvalue[positive])
 
 
 def elastic_iterations(
     source: Basis,
     target: Basis,
     warp: Warp,
-    schedule: Schedule = FOLLOWING,
+    schedule: Schedule = DEFORMATION,
     *,
     vertices: Rows = _ALL,
     landmarks: Landmarks | None = None,
 ) -> Warp:
-    """The warp after iterations in which the target's displacement becomes less and less stiff.
+    """Register the target by iterations of decreasing stiffness and return the warp.
 
     Parameters
     ----------
     source : Basis
-        At full resolution: its surface is searched.
+        At full resolution; its surface is searched.
     target : Basis
         At low resolution, with the normals of the original mesh:
         :attr:`s4a.method.shape.Shape.low_on_surface`.
     warp : tuple (R, t, c)
-        Where to begin, with one transform for all: bending is counted from there.
+        Initialisation with one transform for all vertices, relative to which bending is measured.
     schedule : Schedule
-        Its further steps are made only as long as the one before let the bending energy grow by
-        less than a fifth.
+        The further steps need a growth of the bending energy by less than a fifth in the step
+        before.
     vertices : int ndarray (s,), optional
-        Those of the target that are drawn, each for the area around it; all by default.
+        Vertices of the target that are attracted, each with the area around it; all by default.
     landmarks : Landmarks, optional
 
     Returns
     -------
     warp : tuple (R, t, c)
-        R is a linear map, and no rotation.
+        R is a linear map, not a rotation.
     """
     R, t, c = warp
-    start = turn(target, R, t)  # (n, 3)
-    n = len(start)
+    initial = apply_transform(target, R, t)  # (n, 3)
+    n = len(initial)
     smooth = target.Phi[:, 1:]  # the constant is b
-    E = np.concatenate([smooth, start, np.ones((n, 1))], axis=1)  # (n, K - 1 + 3 + 1)
+    E = np.concatenate([smooth, initial, np.ones((n, 1))], axis=1)  # (n, K - 1 + 3 + 1)
     w = np.zeros((E.shape[1], 3))  # z = E w
     w[: len(c) - 1] = c[1:]
     w[-4:-1] = np.eye(3)
     w[-1] = c[0] * target.Phi[0, 0]
-    apart = _unmixed(E, target.area)
-    unlike = E @ apart
-    at, pin_weight, pin = pins(landmarks, smooth, R, t)
+    B = _decorrelation(E, target.area)
+    E_B = E @ B
+    E_landmark, landmark_weight, goal = landmark_equations(landmarks, smooth, R, t)
     bending = np.zeros((len(w), 1))
     bending[: smooth.shape[1], 0] = target.eigenvalue[1:] ** 2
     X = E @ w
     energies: list[float] = []  # of bending, after each step
     area = target.area if isinstance(vertices, slice) else _sampled_area(target, vertices)
-    F = unlike[vertices]
+    F = E_B[vertices]
     mass = F.T @ (area[:, None] * F)
-    sure = len(schedule.stiffness) - schedule.further
-    for step, stiff in enumerate(schedule.stiffness):
-        if step >= sure and energies[-1] > _SETTLED * energies[-2]:
+    n_fixed = len(schedule.stiffness) - schedule.further
+    for step, stiffness in enumerate(schedule.stiffness):
+        if step >= n_fixed and energies[-1] > _MAX_GROWTH * energies[-2]:
             break
-        price = np.kron(np.eye(3), apart.T @ (stiff * bending * apart))
-        # nothing may be left of the start: a little keeps the matrix definite then
-        price[np.diag_indices_from(price)] += 1e-12
+        penalty = np.kron(np.eye(3), B.T @ (stiffness * bending * B))
+        # keeps the matrix definite if the initial positions are smooth
+        penalty[np.diag_indices_from(penalty)] += 1e-12
         for _ in range(schedule.iterations):
-            y, m = _points_ahead(source, target, X, vertices)
-            # of what w is to change by, so that rounding is of the step and not of what it leads to
+            y, m = _attraction(source, target, X, vertices)
+            # for the change of w, whose rounding is smaller than that of w
             matrix, right = normal_equations(F, area, m, y - X[vertices], SLIDE[step >= 2], mass)
-            boundary = boundary_ahead(source, target, X) if step >= 2 else None
+            boundary = boundary_attraction(source, target, X) if step >= 2 else None
             if boundary is not None:
                 vertex, length, across, y = boundary
-                way = y - X[vertex]
-                more = normal_equations(unlike[vertex], BOUNDARY_WEIGHT * length, across, way, 0.0)
-                matrix += more[0]
-                right += more[1]
-            if len(pin):
-                way = pin - at @ w
-                more = normal_equations(at @ apart, pin_weight, np.zeros_like(way), way, 1.0)
-                matrix += more[0]
-                right += more[1]
-            right -= (apart.T @ (stiff * bending * w)).T.ravel()
-            change = step_of(matrix + price, right)
-            w = w + apart @ change.reshape(3, -1).T
+                weight, residual = BOUNDARY_WEIGHT * length, y - X[vertex]
+                terms = normal_equations(E_B[vertex], weight, across, residual, 0.0)
+                matrix += terms[0]
+                right += terms[1]
+            if len(goal):
+                residual = goal - E_landmark @ w
+                isotropic = np.zeros_like(residual)
+                terms = normal_equations(E_landmark @ B, landmark_weight, isotropic, residual, 1.0)
+                matrix += terms[0]
+                right += terms[1]
+            right -= (B.T @ (stiffness * bending * w)).T.ravel()
+            change = solve_normal_equations(matrix + penalty, right)
+            w = w + B @ change.reshape(3, -1).T
             before, X = X, E @ w
-            if target.area @ ((X - before) ** 2).sum(1) < schedule.still**2:
+            if target.area @ ((X - before) ** 2).sum(1) < schedule.tolerance**2:
                 break
         energies.append((bending * w**2).sum())
     A = w[-4:-1].T  # (3, 3)
@@ -354,37 +350,39 @@ def elastic_iterations(
 
 
 def converging_initialisations(
-    source: Basis, target: Basis, starts: dict[str, Warp], landmarks: Landmarks | None = None
+    source: Basis, target: Basis, warps: dict[str, Warp], landmarks: Landmarks | None = None
 ) -> dict[str, Warp]:
-    """Starts of elastic iterations after steps so stiff that near ones meet; the mean of those.
+    """Apply very stiff iterations to each initialisation and merge those that converge.
 
-    Which of them is the better, small changes of the input decide; the mean follows these.
+    Small changes of the input decide which of two similar ones scores better.  The mean of both
+    varies continuously.
 
     Parameters
     ----------
     source, target, landmarks : see :func:`elastic_iterations`
-    starts : dict
-        Name -> warp (R, t, c), with one transform for all.
+    warps : dict
+        Name -> warp (R, t, c), with one transform for all vertices.
 
     Returns
     -------
     dict
-        Starts that end within :data:`MEET` of the first of some are one, by its name.
+        Name -> mean warp of those within :data:`MERGE_DISTANCE` of the first, by its name.
     """
     options: dict[str, Any] = {"vertices": target.sample_vertices_of(), "landmarks": landmarks}
-    met: dict[str, list[Warp]] = {}
-    for name, start in starts.items():
-        warp = elastic_iterations(source, target, start, MEETING, **options)
+    groups: dict[str, list[Warp]] = {}
+    for name, initial in warps.items():
+        warp = elastic_iterations(source, target, initial, CONVERGENCE, **options)
         X = move(target, warp)
         near = (
-            one
-            for one, (first, *_) in met.items()
-            if np.linalg.norm(X - move(target, first), axis=1) @ target.area < MEET
+            group
+            for group, (representative, *_) in groups.items()
+            if np.linalg.norm(X - move(target, representative), axis=1) @ target.area
+            < MERGE_DISTANCE
         )
-        met.setdefault(next(near, name), []).append(warp)
+        groups.setdefault(next(near, name), []).append(warp)
     return {
-        name: tuple(sum(p) / len(p) for p in zip(*found, strict=True))
-        for name, found in met.items()
+        name: tuple(sum(parameter) / len(parameter) for parameter in zip(*members, strict=True))
+        for name, members in groups.items()
     }
 
 
@@ -397,41 +395,41 @@ def local_iterations(
     time: tuple[float, float] = _TIME,
     slide: float = _LOCAL_SLIDE,
     iterations: int = _N_LOCAL_ITERATIONS,
-    pull: tuple[sp.csr_matrix, Array] | None = None,
+    landmarks: tuple[sp.csr_matrix, Array] | None = None,
 ) -> Array:
-    """A displacement beyond that of elastic iterations, free at every vertex of low resolution.
+    """Compute a displacement of every low-resolution vertex, in addition to elastic iterations.
 
     Parameters
     ----------
-    source, target : Basis
-        As of :func:`elastic_iterations`.
+    source, target : see :func:`elastic_iterations`
     diffusion : Diffusion
-        On the target.
+        Heat diffusion on the target.
     X : float ndarray (n, 3)
-        The target's vertices after the elastic iterations.
+        Vertices of the target after the elastic iterations.
     time : tuple of float
-        Of the heat diffusion in the first and in the last round.
+        Diffusion time of the first and the last iteration.
     slide : float
-        Weight of the way along the surface.
+        Weight of the tangential part.
     iterations : int
-    pull : tuple (P, missing), optional
-        Weights ``(l, n)`` of landmarks on the target, and what d is to be there ``(l, 3)``.
+    landmarks : tuple (P, residual), optional
+        Weights ``(l, n)`` of landmarks on the target, and the residuals ``(l, 3)``, the values of d
+        that reach them.
 
     Returns
     -------
     float ndarray (n, 3)
         d, in the frame of the source.
     """
-    pinned, toward = None, 0.0
-    if pull is not None:
-        P, missing = pull
-        pinned = _LANDMARK_WEIGHT * P.T @ P
-        toward = _LANDMARK_WEIGHT * P.T @ missing
+    matrix, right = None, 0.0
+    if landmarks is not None:
+        P, residual = landmarks
+        matrix = _LANDMARK_WEIGHT * P.T @ P
+        right = _LANDMARK_WEIGHT * P.T @ residual
     d = np.zeros_like(X)
     for step in np.geomspace(*time, iterations):
-        y, m = _points_ahead(source, target, X + d)
-        way = y - X - d
-        across = np.einsum("ni,ni->n", m, way)[:, None] * m
-        goal = d + slide * way + (1 - slide) * across
-        d = diffusion.step(step, pinned)(target.area[:, None] * goal + toward)
+        y, m = _attraction(source, target, X + d)
+        offset = y - X - d
+        across = np.einsum("ni,ni->n", m, offset)[:, None] * m
+        goal = d + slide * offset + (1 - slide) * across
+        d = diffusion.step(step, matrix)(target.area[:, None] * goal + right)
     return d

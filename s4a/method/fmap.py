@@ -1,7 +1,8 @@
 """Functional maps (3.3, 4.1): fit, map <-> match (eq. 1 and 2), ZoomOut.
 
-The source is the paper's M with basis Phi, the target its N with basis Psi.  C carries functions
-source -> target; a match holds, for every vertex of the target, a vertex of the source.
+The source is the paper's M with basis Phi, the target N with basis Psi.  C maps functions of the
+source to functions of the target; a match holds, for every vertex of the target, a vertex of the
+source.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,17 +18,17 @@ from s4a.schema import Array
 
 
 def heat_filter(eigenvalue: Array, *others: Array, n: int = 100) -> Array:
-    """Filters exp(-t lambda) of the heat kernel at n times ``(n, k)``, each of sum 1.
+    """Return filters exp(-t lambda) of the heat kernel at n times ``(n, k)``, each of sum 1.
 
-    Of Sun, Ovsjanikov and Guibas (2009).  The times are spaced evenly in their logarithm from 4 ln
-    10 / lambda_k to 4 ln 10 / lambda_1; with the spectra of other shapes only as far as all of them
-    reach, so that both ends of a pair are filtered alike.
+    Times are spaced logarithmically from 4 ln 10 / lambda_k to 4 ln 10 / lambda_1 (Sun, Ovsjanikov
+    and Guibas 2009), restricted to the range of all given spectra, so that both shapes of a pair
+    have the same filters.
 
     Parameters
     ----------
     eigenvalue : float ndarray (k,)
     *others : float ndarray (k_2,)
-        Spectra of the shapes that it is compared with.
+        Eigenvalues of the shapes to compare with.
     n : int
 
     Examples
@@ -46,11 +47,11 @@ def heat_filter(eigenvalue: Array, *others: Array, n: int = 100) -> Array:
 
 
 def wave_filter(eigenvalue: Array, *others: Array, n: int = 100) -> Array:
-    """Filters exp(-(e - log lambda)^2 / 2 s^2) of the wave kernel at n energies ``(n, k)``.
+    """Return filters exp(-(e - log lambda)^2 / 2 s^2) of the wave kernel at n energies ``(n, k)``.
 
-    Each of sum 1, as Aubry, Schlickewei and Cremers (2011) set them: s is 7 n-th parts of the range
-    of log lambda, and the energies are spaced evenly in that range less 2 s at both ends.  Modes of
-    eigenvalue 0 take no part.
+    Each has the sum 1.  As in Aubry, Schlickewei and Cremers (2011), s is 7/n of the range of
+    log lambda, and energies are spaced evenly in that range less 2 s at both ends.  Eigenvalues 0
+    are excluded.
 
     Parameters
     ----------
@@ -61,19 +62,19 @@ def wave_filter(eigenvalue: Array, *others: Array, n: int = 100) -> Array:
     high = min(np.log(s[-1]) for s in spectra)
     sigma = 7 * (high - low) / n
     energy = np.linspace(low + 2 * sigma, high - 2 * sigma, n)
-    moving = eigenvalue > 0
+    positive = eigenvalue > 0
     kernel = np.zeros((n, len(eigenvalue)))
-    exponent = -((energy[:, None] - np.log(eigenvalue[moving])) ** 2) / (2 * sigma**2)
-    exponent -= exponent.max(axis=1, keepdims=True)  # no row vanishes, however far its energy is
-    kernel[:, moving] = np.exp(exponent)
+    exponent = -((energy[:, None] - np.log(eigenvalue[positive])) ** 2) / (2 * sigma**2)
+    exponent -= exponent.max(axis=1, keepdims=True)  # no row underflows to zero
+    kernel[:, positive] = np.exp(exponent)
     return kernel / kernel.sum(axis=1, keepdims=True)
 
 
 def signature(Phi: Array, kernel: Array) -> Array:
-    """Signature of every vertex ``(n, f)``: the squared eigenfunctions through f filters.
+    """Return the signature of every vertex ``(n, f)``: squared eigenfunctions times f filters.
 
-    It does not change with the signs of the eigenfunctions, nor between the sides of a symmetric
-    shape.
+    It does not depend on the signs of the eigenfunctions, and cannot distinguish the sides of a
+    symmetric shape.
 
     Parameters
     ----------
@@ -84,19 +85,19 @@ def signature(Phi: Array, kernel: Array) -> Array:
 
 
 def landmark_coefficients(Phi: Array, kernel: Array, landmark: Array) -> Array:
-    """Coefficients ``(k, p f)`` of the signatures around p vertices, filter by filter for each."""
+    """Return the coefficients ``(k, p f)`` of the signatures around p vertices with f filters."""
     return np.einsum("fk,pk->kpf", kernel, Phi[landmark]).reshape(Phi.shape[1], -1)
 
 
 def landmark_signature(Phi: Array, kernel: Array, landmark: Array) -> Array:
-    """Signature of every vertex around p vertices ``(n, p f)``; it tells symmetric sides apart."""
+    """Return signatures around p vertices ``(n, p f)``, which distinguish symmetric sides."""
     return Phi @ landmark_coefficients(Phi, kernel, landmark)
 
 
 def hks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None = None) -> Array:
     """Heat kernel signature ``(n_vertices, n)``, or around p landmarks ``(n_vertices, p n)``.
 
-    Its filters are those of :func:`heat_filter`.
+    The filters are those of :func:`heat_filter`.
 
     Parameters
     ----------
@@ -104,8 +105,17 @@ def hks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None =
         Eigenfunctions; more than 100 change little.
     eigenvalue : float ndarray (k,)
     n : int
-        Times.
+        Number of times.
     landmark : int ndarray (p,), optional
+
+    See Also
+    --------
+    wks : Wave kernel signature, with finer detail.
+
+    References
+    ----------
+    Sun, J., Ovsjanikov, M. and Guibas, L. (2009). A concise and provably informative multi-scale
+    signature based on heat diffusion. Computer Graphics Forum 28(5).
 
     Examples
     --------
@@ -124,24 +134,33 @@ def hks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None =
 def wks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None = None) -> Array:
     """Wave kernel signature ``(n_vertices, n)``, or around p landmarks ``(n_vertices, p n)``.
 
-    Its filters are those of :func:`wave_filter`.  It holds finer detail than :func:`hks`, whose low
-    modes weigh on all times.
+    The filters are those of :func:`wave_filter`.  It has finer detail than :func:`hks`, where low
+    frequencies contribute to all times.
 
     Parameters
     ----------
     Phi, eigenvalue, landmark : see :func:`hks`
     n : int
-        Energies.
+        Number of energies.
+
+    See Also
+    --------
+    hks : Heat kernel signature.
+
+    References
+    ----------
+    Aubry, M., Schlickewei, U. and Cremers, D. (2011). The wave kernel signature: a quantum
+    mechanical approach to shape analysis. ICCV Workshops.
     """
     kernel = wave_filter(eigenvalue, n=n)
     return signature(Phi, kernel) if landmark is None else landmark_signature(Phi, kernel, landmark)
 
 
 def mean_curvature(X: Array, normals: Array, area: Array, Phi: Array, eigenvalue: Array) -> Array:
-    """Signed mean curvature ``(n,)`` of the surface that k eigenfunctions keep of a mesh.
+    """Return the signed mean curvature ``(n,)`` of a mesh smoothed to k eigenfunctions.
 
-    Half of <L X, normal>, L X = Phi Lambda Phi^T A X: positive where the surface bulges outwards.
-    Unlike signatures it changes with the embedding, and tells the front of a body from its back.
+    Half of <L X, normal> with L X = Phi Lambda Phi^T A X, positive for convex surfaces.  Unlike
+    signatures it depends on the embedding, and distinguishes the front of a body from the back.
 
     Parameters
     ----------
@@ -163,9 +182,9 @@ def mean_curvature(X: Array, normals: Array, area: Array, Phi: Array, eigenvalue
 
 
 def multiplication(Phi: Array, area: Array, f: Array) -> Array:
-    """Operators g -> f g in the basis: Phi^T A diag(f) Phi for d functions ``(d, k, k)``.
+    """Return operators g -> f g in the basis: Phi^T A diag(f) Phi for d functions ``(d, k, k)``.
 
-    After Nogneng and Ovsjanikov (2017).
+    Multiplication operators of Nogneng and Ovsjanikov (2017).
 
     Parameters
     ----------
@@ -186,17 +205,17 @@ def multiplication(Phi: Array, area: Array, f: Array) -> Array:
 
 
 def orientation(T: Array, Phi: Array, f: Array) -> Array:
-    """Operators g -> <grad f x grad g, normal> in the basis ``(d, k, k)``.
+    """Return the operators g -> <grad f x grad g, normal> in the basis ``(d, k, k)``.
 
-    Of Ren, Poulenard, Wonka and Ovsjanikov (2018).  Of linear functions on a triangle its integral
-    is half the determinant of their differences along two sides: the triangle's shape drops out.
-    The operators change sign where a map turns the surface over, which tells the sides of a
-    symmetric shape apart.
+    Orientation operators of Ren, Poulenard, Wonka and Ovsjanikov (2018).  The integral for linear
+    functions on a triangle is half the determinant of their differences along two sides.  The
+    operators change sign under orientation-reversing maps, which distinguishes the sides of a
+    symmetric shape.
 
     Parameters
     ----------
     T : int ndarray (m, 3)
-        Triangles, turned the same way.
+        Triangles of consistent orientation.
     Phi : float ndarray (n, k)
         Basis, orthonormal in the vertex areas.
     f : float ndarray (n, d)
@@ -220,10 +239,10 @@ def orientation(T: Array, Phi: Array, f: Array) -> Array:
     return np.stack(operators)
 
 
-LAPLACIAN = 1e-3  # weight of the term that the Laplacians commute
-EVERY = 5  # of 100 energies or times every fifth is used: neighbours are nearly equal
+LAPLACIAN = 1e-3  # weight of Laplacian commutativity
+EVERY = 5  # every fifth of 100 energies or times is used, as neighbours are nearly equal
 _FILTERS = {"wks": wave_filter, "hks": heat_filter}
-SCALES = (20, 40, 60, 90)  # functions that mean curvatures are of
+SCALES = (20, 40, 60, 90)  # numbers of eigenfunctions of the mean curvatures
 
 
 def fmap_from_match(
@@ -232,14 +251,14 @@ def fmap_from_match(
     area_target: Array | sp.sparray | sp.spmatrix,
     match: Array,
 ) -> Array:
-    """C = Psi^T A_N Phi[match]: the map of functions that a match gives (eq. 1 in both bases).
+    """Return the functional map of a match, C = Psi^T A_N Phi[match] (eq. 1 in both bases).
 
     Parameters
     ----------
     Phi_source : float ndarray (n_source, k)
     Phi_target : float ndarray (n_target, k)
     area_target : float ndarray (n_target,), of sum 1, or a sparse matrix
-        What Phi_target is orthonormal in.
+        Mass matrix in which Phi_target is orthonormal.
     match : int ndarray (n_target,)
 
     Returns
@@ -254,7 +273,7 @@ def fmap_from_match(
 def match_from_fmap(
     C: Array, Phi_source: Array, Phi_target: Array, *, nearest: Callable[..., Any] = nearest_rows
 ) -> Array:
-    """Nearest neighbours of the rows of Psi among those of Phi C^T (eq. 2)."""
+    """Return the match of a functional map: nearest rows of Phi C^T to those of Psi (eq. 2)."""
     k_target, k_source = C.shape
     return nearest(Phi_target[:, :k_target], Phi_source[:, :k_source] @ C.T)
 
@@ -268,25 +287,34 @@ def zoomout(
     step: int = 5,
     nearest: Callable[..., Any] = nearest_rows,
 ) -> tuple[Array, Array]:
-    """ZoomOut (4.1; Melzi et al. 2019): C -> match -> a larger C, until it is k x k.
+    """Refine a functional map by ZoomOut (4.1) until it is k x k.
 
     Parameters
     ----------
     source, target : Basis
-        With k functions or more.
+        With at least k functions.
     C : float ndarray (k_init, k_init)
     k : int
         Final size.
     step : int
-        Growth per round.
+        Growth per iteration.
     nearest : callable
-        As :func:`s4a.method.nearest.nearest_rows`, which is it by default.
+        Nearest-neighbour search with the signature of :func:`s4a.method.nearest.nearest_rows`.
 
     Returns
     -------
     C : float ndarray (k, k)
     match : int ndarray (n_target,)
         The match of the final C.
+
+    See Also
+    --------
+    s4a.refine_network : Consistent ZoomOut of a collection.
+
+    References
+    ----------
+    Melzi, S. et al. (2019). ZoomOut: spectral upsampling for efficient shape correspondence. ACM
+    TOG 38(6).
     """
     sizes = [*range(C.shape[0] + step, k, step), k] if k > C.shape[0] else []
     for size in sizes:
@@ -296,11 +324,11 @@ def zoomout(
 
 
 def refine_once(source: Basis, target: Basis, C: Array, n_samples: int = 0) -> Array:
-    """One step of ZoomOut without growth (4.2): C -> match -> C of the same size.
+    """Apply one step of ZoomOut without growth (4.2): C -> match -> C of the same size.
 
-    Where `n_samples` is not 0, matches are looked for at as many spread vertices of the target, and
-    C is the least squares there, as in the iterations of Consistent ZoomOut; at all of them where
-    they are fewer than the functions, which cannot be told apart then.
+    With `n_samples` > 0 only as many samples of the target are matched, and C is the least-squares
+    solution on them, as in Consistent ZoomOut.  If there are fewer samples than functions, all
+    vertices are used.
     """
     Phi = source.Phi[:, : C.shape[1]]
     Psi = target.Phi[:, : len(C)]
@@ -321,30 +349,33 @@ def fit(
     operators: Sequence[tuple[float, Array, Array]] = (),
     constant: float = 1.0,
 ) -> Array:
-    """The C of least energy that carries constants to constants (step 4 of 4.1).
+    """Fit a functional map that maps constants to constants by least squares (step 4 of 4.1).
 
-    After Ovsjanikov et al. (2012).
-
-    E(C) = |C F - G|^2 + sum penalty C^2 + sum w |C P - Q C|^2, whose normal equations are solved
-    directly: row by row where there are no operators, else all k_target (k_source - 1) unknowns at
-    once, a dense system of 50 MB for 50 x 50 and 800 MB for 100 x 100.
+    E(C) = |C F - G|^2 + sum penalty C^2 + sum w |C P - Q C|^2.  The normal equations are solved
+    directly: row by row without operators, else for all k_target (k_source - 1) unknowns at once, a
+    dense system of 50 MB for 50 x 50 and 800 MB for 100 x 100.
 
     Parameters
     ----------
     F, G : float ndarray (k_source, d), (k_target, d)
         Coefficients of corresponding functions.
     penalty : float ndarray (k_target, k_source)
-        On the squared entries: that the Laplacians commute is w (mu_i - lambda_j)^2.
+        Penalty on the squared entries: w (mu_i - lambda_j)^2 for Laplacian commutativity.
     operators : list of tuple (w, P, Q)
         Weight, and stacks of corresponding operators (p, k_source, k_source) and (p, k_target,
         k_target).
     constant : float
-        C[0, 0]: 1 where both first eigenfunctions are positive.
+        C[0, 0]: 1 if both first eigenfunctions are positive.
 
     Returns
     -------
     C : float ndarray (k_target, k_source)
-        Its first column is known: `constant`, then zeros.
+        The first column is given: `constant`, then zeros.
+
+    References
+    ----------
+    Ovsjanikov, M. et al. (2012). Functional maps: a flexible representation of maps between shapes.
+    ACM TOG 31(4).
 
     Examples
     --------
@@ -380,15 +411,15 @@ def fit(
 
 
 def _commutator(source, target):
-    """(mu_i - lambda_j)^2 / lambda_max^2 ``(k_target, k_source)``, small where C may be large.
+    """Weights (mu_i - lambda_j)^2 / lambda_max^2 ``(k_target, k_source)`` of squared entries of C.
 
-    Weighted by it, the squared entries of C say how far C is from commuting with the Laplacians.
+    The weighted sum measures how far C is from commuting with the Laplacians.
     """
     return ((target[:, None] - source) / max(source[-1], target[-1])) ** 2
 
 
 def _constant_to_constant(source, target):
-    """C[0, 0] of a map that takes constants to constants: the product of their signs."""
+    """C[0, 0] of a map from constants to constants: the product of their signs."""
     return np.sign(source.Phi[0, 0] * target.Phi[0, 0])
 
 
@@ -400,7 +431,7 @@ def fmap_from_landmarks(
     *,
     commute: float = LAPLACIAN,
 ) -> Array:
-    """C from landmark pairs (step 4 of 4.1): heat kernels around them kept, Laplacians commute.
+    """Fit a functional map to heat kernels around landmark pairs (step 4 of 4.1).
 
     :func:`fit` with F and G at 8 times and the penalty commute |F|^2 (mu_i - lambda_j)^2 /
     lambda_max^2.
@@ -436,64 +467,63 @@ def fmap_from_descriptors(
     oriented: float = 1.0,
     curvature: float = 0.0,
 ) -> Array:
-    """C ``(k, k)`` fitted on descriptors, with or without landmarks (step 4 of 4.1).
+    """Fit a functional map ``(k, k)`` to descriptors, with or without landmarks (step 4 of 4.1).
 
     :func:`fit` of E(C) = |C F - G|^2 / |F|^2 + 1e-3 sum (mu_i - lambda_j)^2 C_ij^2 /
-    lambda_max^2 + sum |C P - Q C|^2 / sum |P|^2, where F and G are the coefficients of the
-    descriptors, P and Q the products with them, and the same once more with `oriented` for the
-    operators that a mirror image turns over.  Descriptors are taken with all functions that there
-    are, less their mean, scaled to norm 1.
+    lambda_max^2 + sum |C P - Q C|^2 / sum |P|^2.  F and G are the coefficients of the descriptors,
+    P and Q their multiplication operators; the same term with the weight `oriented` has their
+    orientation operators.  Descriptors use all eigenfunctions, are centred, and have norm 1.
 
     Parameters
     ----------
     source, target : Basis
-        With all functions that there are; the triangles are for `oriented`.  The fields that guide
-        both are descriptors too.
+        With all eigenfunctions; triangles are needed for `oriented`.  Common fields of both are
+        descriptors, too.
     k : int
         Size of the map.
     landmarks : tuple of int ndarray (p,)
-        Corresponding vertices; descriptors around each are added to those of the shapes.
+        Corresponding vertices; descriptors around each are added.
     kind : {"wks", "hks", "hks+wks"}
         Wave or heat kernel signatures, or both.
     oriented : float
-        Weight against that of preserving the descriptors; 0 leaves the term out.
+        Weight of the orientation term; 0 omits it.
     curvature : float
-        Weight of signed mean curvatures at four scales beside a signature.
+        Weight of signed mean curvatures at four scales relative to a signature.
     """
-    F, products, turns = [], [], []  # of source and target
-    for end, other, landmark in zip((source, target), (target, source), landmarks, strict=True):
-        filters = [_FILTERS[one](end.eigenvalue, other.eigenvalue) for one in kind.split("+")]
+    F, products, orientations = [], [], []  # of source and target
+    for shape, other, landmark in zip((source, target), (target, source), landmarks, strict=True):
+        filters = [_FILTERS[name](shape.eigenvalue, other.eigenvalue) for name in kind.split("+")]
         kernel = np.concatenate([values[::EVERY] for values in filters])
-        given = [signature(end.Phi, kernel)]  # (n, d)
+        descriptors = [signature(shape.Phi, kernel)]  # (n, d)
         if landmark is not None:
-            given.append(landmark_signature(end.Phi, kernel, landmark))
-        given += [end.fields[name] for name in common_fields(source, target)]
-        f = np.column_stack([*given, *(curvatures(end) if curvature else [])])
-        f = f - end.area @ f
-        f /= np.sqrt(end.area @ f**2)
+            descriptors.append(landmark_signature(shape.Phi, kernel, landmark))
+        descriptors += [shape.fields[name] for name in common_fields(source, target)]
+        f = np.column_stack([*descriptors, *(curvatures(shape) if curvature else [])])
+        f = f - shape.area @ f
+        f /= np.sqrt(shape.area @ f**2)
         if curvature:
             f[:, -len(SCALES) :] *= np.sqrt(curvature)
-        Phi = end.Phi[:, :k]
-        F.append(Phi.T @ (end.area[:, None] * f))  # (k, d)
-        products.append(multiplication(Phi, end.area, f))
+        Phi = shape.Phi[:, :k]
+        F.append(Phi.T @ (shape.area[:, None] * f))  # (k, d)
+        products.append(multiplication(Phi, shape.area, f))
         if oriented:
-            turns.append(orientation(end.T, Phi, f))
+            orientations.append(orientation(shape.T, Phi, f))
     operators = [
-        (weight / (ends[0] ** 2).sum(), *ends)
-        for weight, ends in ((1.0, products), (oriented, turns))
+        (weight / (pair[0] ** 2).sum(), *pair)
+        for weight, pair in ((1.0, products), (oriented, orientations))
         if weight
     ]
-    size = np.linalg.norm(F[0])
+    norm = np.linalg.norm(F[0])
     penalty = LAPLACIAN * _commutator(source.eigenvalue[:k], target.eigenvalue[:k])
     constant = _constant_to_constant(source, target)
-    return fit(F[0] / size, F[1] / size, penalty=penalty, operators=operators, constant=constant)
+    return fit(F[0] / norm, F[1] / norm, penalty=penalty, operators=operators, constant=constant)
 
 
 def curvature_difference(source: Basis, target: Basis, match: Array) -> float:
-    """How far the signed mean curvature of matched vertices differs, by its spread on the target.
+    """Mean difference of signed mean curvature between matched vertices, relative to its deviation.
 
-    0 where it is the same, about 1 where one says nothing of the other.  Front and back of a body,
-    which lie alike in every other way, differ by it.
+    0 for equal curvatures, about 1 for unrelated ones.  It distinguishes the front and back of a
+    body, whose intrinsic geometry is nearly the same.
 
     Parameters
     ----------
@@ -502,27 +532,29 @@ def curvature_difference(source: Basis, target: Basis, match: Array) -> float:
     """
     H = curvatures(source)[0][match]
     G = curvatures(target)[0]
-    spread = target.area @ np.abs(G - target.area @ G)
-    return float(target.area @ np.abs(H - G) / spread)
+    deviation = target.area @ np.abs(G - target.area @ G)
+    return float(target.area @ np.abs(H - G) / deviation)
 
 
-def curvatures(end: Basis) -> list[Array]:
-    """Signed mean curvatures ``(n,)`` of an end by :data:`SCALES` of its functions."""
-    return [
-        mean_curvature(end.X, end.normals, end.area, end.Phi[:, :k], end.eigenvalue[:k])
-        for k in SCALES
-    ]
+def curvatures(basis: Basis) -> list[Array]:
+    """Return signed mean curvatures ``(n,)`` for the numbers of functions :data:`SCALES`."""
+    X, normals, area, Phi, eigenvalue = (
+        basis.X,
+        basis.normals,
+        basis.area,
+        basis.Phi,
+        basis.eigenvalue,
+    )
+    return [mean_curvature(X, normals, area, Phi[:, :k], eigenvalue[:k]) for k in SCALES]
 
 
 def orthogonality_error(C: Array) -> float:
-    """|C^T C - I|_F / sqrt(k): 0 for a map that preserves areas."""
+    """Return |C^T C - I|_F / sqrt(k), which is 0 for area-preserving maps."""
     return float(np.linalg.norm(C.T @ C - np.eye(C.shape[1])) / np.sqrt(C.shape[1]))
 
 
 def off_diagonal_mass(C: Array) -> float:
-    """Share of the squared entries of C that is not on its diagonal.
-
-    0 for a map between equal spectra.
+    """Return the share of the squared entries of C off the diagonal; 0 for isometric shapes.
 
     Examples
     --------
@@ -535,13 +567,11 @@ def off_diagonal_mass(C: Array) -> float:
 
 
 def swapped_blocks(C: Array) -> list[tuple[int, int]]:
-    """Runs of modes that the map exchanges among each other (Fig. 2).
+    """Find runs of eigenfunctions that a map exchanges (Fig. 2), as on symmetric shapes.
 
-    Those of symmetric shapes do so, whose eigenvalues are nearly equal.
-
-    A run of at most six counts when at least three quarters of the squared entries of its rows and
-    columns lie in its diagonal block, and less than half of that on the diagonal itself; the
-    shortest runs come first.
+    A run of at most six counts if its diagonal block has at least three quarters of the squared
+    entries of its rows and columns, and less than half of that is on the diagonal.  Shorter runs
+    have precedence.
 
     Parameters
     ----------
@@ -550,7 +580,7 @@ def swapped_blocks(C: Array) -> list[tuple[int, int]]:
     Returns
     -------
     list of (int, int)
-        First and last mode of each run, ascending; runs do not overlap.
+        First and last eigenfunction of each run, ascending, without overlaps.
 
     Examples
     --------
@@ -561,16 +591,16 @@ def swapped_blocks(C: Array) -> list[tuple[int, int]]:
     """
     S = np.asarray(C, float) ** 2
     runs = []
-    taken = set()
+    used = set()
     for length in range(2, 7):
-        for first in range(min(S.shape) - length + 1):
-            run = slice(first, first + length)
+        for start in range(min(S.shape) - length + 1):
+            run = slice(start, start + length)
             block = S[run, run]
-            around = (S[run].sum() + S[:, run].sum()) / 2
-            closed = around > 0 and block.sum() >= 0.75 * around
+            total = (S[run].sum() + S[:, run].sum()) / 2
+            closed = total > 0 and block.sum() >= 0.75 * total
             exchanged = np.trace(block) < 0.5 * block.sum()
-            modes = range(first, first + length)
-            if closed and exchanged and taken.isdisjoint(modes):
-                runs.append((first, first + length - 1))
-                taken.update(modes)
+            indices = range(start, start + length)
+            if closed and exchanged and used.isdisjoint(indices):
+                runs.append((start, start + length - 1))
+                used.update(indices)
     return sorted(runs)

@@ -1,7 +1,7 @@
-"""First functional maps (4.1, steps 2 to 4), and one step of ZoomOut ahead (4.2).
+"""Initial functional maps (4.1, steps 2 to 4), and their refinement by a step of ZoomOut (4.2).
 
-The paper's way is from nearest neighbours after ICP, of all vertices or of 10 landmarks.  Where
-poses are far apart these are wrong: then the best of several maps is taken.
+As in the paper, maps are fitted to nearest neighbours after ICP, of all vertices or 10 landmarks.
+If poses differ much, these are wrong, and the best of several maps is used.
 """
 
 import itertools
@@ -21,36 +21,36 @@ from s4a.options import check
 from s4a.schema import Array
 
 N_LANDMARKS = 10  # of step 3
-# Of a pair alone, in a far pose: signatures, functions by k_init, and weight of the orientation.
-# Signed mean curvature goes with each: front and back of a body differ by nothing else
+# maps that a search tries for a pair: signatures, number of functions relative to k_init, weight of
+# orientation.  All use signed mean curvature, which distinguishes front and back of a body
 SEARCHED = tuple(itertools.product(("hks+wks", "wks", "hks"), (0.5, 1.0, 1.5), (1.0, 10.0)))
-N_ENDS, N_ENDS_OTHER = 5, 7  # extremities of one shape, and of the other among which they are
-N_PAIRED = 8  # the likeliest ways to pair them
-_CURVATURE = 3.0  # its weight by that of a signature
-_ON_A_LINE = 0.02  # of sqrt(area): landmarks as near to a line say nothing of turns about it
-_BENT = 0.3  # weight of the gap of curvatures in that score
-SHORT = 60  # functions of the short ZoomOut that a map is scored after
-_FOUND = 0.07  # score at which the search ends; of wrong maps between bodies it is 0.11 or more
+N_ENDS, N_ENDS_OTHER = 5, 7  # extremities of one shape, matched to some of those of the other
+N_PAIRED = 8  # number of best pairings
+_CURVATURE = 3.0  # weight of mean curvature relative to a signature
+_COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
+_CURVATURE_WEIGHT = 0.3  # of the curvature difference in the score of a search
+SHORT = 60  # functions of the short ZoomOut before a map is scored
+_MAX_SCORE = 0.07  # at which the search ends; wrong maps between bodies score 0.11 or more
 
 
 class _InitialMap(NamedTuple):
-    """An initial map of a directed pair, and what it was made of."""
+    """Initial map of a directed pair, and the data to which it was fitted."""
 
-    name: str  # "dense", "landmarks", or of far poses that of best_initial_map
+    name: str  # "dense", "landmarks", or the name of best_initial_map
     C: Array  # (k_init, k_init)
-    fitted: Array  # (k_init, k_init), before the step of ZoomOut ahead
-    near: Array  # (n_target,), nearest neighbours in space after the transform
-    landmarks: tuple[Array, Array] | None  # of source and target, where it was fitted so
+    fitted: Array  # (k_init, k_init), before the step of ZoomOut
+    near: Array  # (n_target,), nearest neighbours in space after the rigid transform
+    landmarks: tuple[Array, Array] | None  # of source and target, with init="landmarks"
 
 
 def transform_onto(source: Basis, target: Basis) -> RigidTransform:
-    """Rigid transform (R, t) of the source onto the target by ICP (4.1, step 2).
+    """Return the rigid transform (R, t) of the source onto the target by ICP (4.1, step 2).
 
-    It begins where landmarks say, if both have three or more that do not lie on one line.
+    Three or more common landmarks that are not collinear give the initial transform.
     """
     at_source, at_target = corresponding_landmarks(source, target)
     P = source.X[at_source]
-    if len(P) < 3 or np.linalg.svd(P - P.mean(0), compute_uv=False)[1] < _ON_A_LINE:
+    if len(P) < 3 or np.linalg.svd(P - P.mean(0), compute_uv=False)[1] < _COLLINEAR:
         R, t, _ = align(source.X, source.area, target.X, target.area)
         return R, t
     R, t, _ = rigid_transform(P, target.X[at_target])
@@ -58,9 +58,9 @@ def transform_onto(source: Basis, target: Basis) -> RigidTransform:
 
 
 def nearest_after_alignment(source: Basis, target: Basis, transform: RigidTransform) -> Array:
-    """The vertex of the moved source nearest to every vertex of the target ``(n_target,)``.
+    """Return the nearest vertex of the aligned source for every target vertex ``(n_target,)``.
 
-    Nearest in position and in the fields that guide both.
+    Nearest in position and common fields.
     """
     R, t = transform
     P, Q = source.X @ R.T + t, target.X
@@ -72,7 +72,7 @@ def nearest_after_alignment(source: Basis, target: Basis, transform: RigidTransf
 
 
 def landmarks_after_alignment(X: Array, Y: Array, transform: RigidTransform) -> tuple[Array, Array]:
-    """Step 3: ten spread vertices of the source, and the vertices of the target nearest to them.
+    """Return ten farthest-point samples of the source and their nearest target vertices (step 3).
 
     Parameters
     ----------
@@ -89,8 +89,8 @@ def landmarks_after_alignment(X: Array, Y: Array, transform: RigidTransform) -> 
 def fit_after_alignment(
     source: Basis, target: Basis, transform: RigidTransform, *, k_init: int, init: str, near: Array
 ) -> tuple[Array, tuple[Array, Array] | None]:
-    """The map as it is fitted, and with ``init="landmarks"`` the landmarks of both."""
-    M, N = source.first(k_init), target.first(k_init)
+    """Fit a map, and return it with the landmarks of both shapes (None with ``init="dense"``)."""
+    M, N = source.truncated(k_init), target.truncated(k_init)
     if init == "dense":
         return fmap.fmap_from_match(M.Phi, N.Phi, N.mass, near), None
     landmarks = landmarks_after_alignment(M.X, N.X, transform)
@@ -107,7 +107,7 @@ def map_after_alignment(
     initial_refinement: bool = True,
     n_samples: int = 0,
 ) -> _InitialMap:
-    """First functional map of a directed pair (4.1, steps 3 and 4).
+    """Compute the initial functional map of a directed pair (4.1, steps 3 and 4).
 
     Parameters
     ----------
@@ -116,11 +116,11 @@ def map_after_alignment(
     transform : tuple (R, t)
         Rigid transform of the source onto the target (step 2).
     init : {"dense", "landmarks"}
-        From all vertices' nearest neighbours, or the paper's fit on 10 farthest points.
+        Fit to nearest neighbours of all vertices, or as in the paper to 10 farthest points.
     initial_refinement : bool
-        Whether one step of ZoomOut is done ahead (4.2).
+        Whether to refine the map by a step of ZoomOut (4.2).
     n_samples : int
-        Of that step, see :func:`s4a.method.fmap.refine_once`.
+        Samples of that step, see :func:`s4a.method.fmap.refine_once`.
     """
     check("init", init)
     near = nearest_after_alignment(source, target, transform)
@@ -132,7 +132,7 @@ def map_after_alignment(
 
 
 def stretch(target: Basis, X: Array) -> float:
-    """Median |log| of the edges' lengths where the target is at X ``(n, 3)``, by its own."""
+    """Return the median |log| ratio of edge lengths with target vertices at X ``(n, 3)``."""
     ends = edges(target.T).T  # (2, e)
     after, before = (
         np.maximum(np.linalg.norm(np.subtract(*P[ends]), axis=1), 1e-12) for P in (X, target.X)
@@ -143,16 +143,15 @@ def stretch(target: Basis, X: Array) -> float:
 def best_initial_map(
     source: Basis, target: Basis, C: Array, fitted: Array | None = None, *, search: bool = False
 ) -> tuple[str, Array, Array]:
-    """Return the best of an initial map and of those from heat and wave kernels.
+    """Return the best of the map from ICP and maps fitted to heat and wave kernels.
 
-    Where both have landmarks, also of one from wave kernels and these.
-
-    Either kind alone fails on some pairs: shapes that nearly are their own mirror image are turned
-    over, or limbs exchanged.  Each map is refined by a short ZoomOut and a few iterations of
-    :func:`s4a.method.spectral_icp.coarse_spectral_icp` by parts; their end is scored without truth,
-    :func:`s4a.method.spectral_icp.registration_score` + :func:`stretch`, as a pose hardly stretches
-    the surface, + in a search 0.3 :func:`s4a.method.fmap.curvature_difference`, which tells front
-    from back.
+    If both shapes have landmarks, also a map fitted to wave kernels around these.  No descriptor
+    works for all pairs: nearly symmetric shapes are flipped, or limbs exchanged.  Each map is
+    refined by a short ZoomOut and piecewise rigid iterations of
+    :func:`s4a.method.spectral_icp.coarse_spectral_icp`.  The result is scored without ground truth
+    by :func:`s4a.method.spectral_icp.registration_score` + :func:`stretch`, as changes of pose
+    hardly stretch a surface.  A search adds 0.3 :func:`s4a.method.fmap.curvature_difference`, which
+    distinguishes front and back.
 
     Parameters
     ----------
@@ -161,42 +160,43 @@ def best_initial_map(
     C : float ndarray (k_init, k_init)
         Initial map from ICP.
     fitted : float ndarray (k_init, k_init), optional
-        That map before its step of ZoomOut; C where there was none.
+        The same before the step of ZoomOut; C by default.
     search : bool
-        Whether to go on through :func:`paired_extremities` and :data:`SEARCHED` until the first two
-        terms of a score are below ``_FOUND``.
+        Whether to continue with :func:`paired_extremities` and :data:`SEARCHED` until the first two
+        terms of a score are below ``_MAX_SCORE``.
 
     Returns
     -------
     name : str
-        "icp", "marked", "hks" or "wks", or of the search as "extremities 1" or
+        "icp", "marked", "hks" or "wks", or from the search "extremities 1" or
         "hks+wks, curvature, k 10, oriented 1".
     C, fitted : float ndarray (k_init, k_init)
-        The map, and as it was before its step of ZoomOut.
+        The map after and before the step of ZoomOut.
     """
     k = min(SHORT, source.k, target.k)
     maps = [("icp", C, C if fitted is None else fitted)]
     maps += _map_from_landmarks(source, target, len(C))
     best = np.inf
-    tried = []  # score, name, map, fit
-    for one in itertools.chain(maps, maps_from_signatures(source, target, len(C), search)):
-        match = fmap.zoomout(source, target, one[1], k, step=10)[1]
-        end = spectral_icp.coarse_spectral_icp(
-            source, target, match, k_first=20, step=20, iterations=1, by_parts=True
+    scored = []  # score, name, map, fit
+    for candidate in itertools.chain(maps, maps_from_signatures(source, target, len(C), search)):
+        match = fmap.zoomout(source, target, candidate[1], k, step=10)[1]
+        match, warp = spectral_icp.coarse_spectral_icp(
+            source, target, match, k_first=20, step=20, iterations=1, articulated=True
         )
-        image = spectral_icp.move(target, end[1])
-        gap = spectral_icp.registration_score(source, target, end[0], target.moved_to(image))
-        score = gap + stretch(target, image)
+        image = spectral_icp.move(target, warp)
+        score = spectral_icp.registration_score(source, target, match, target.moved_to(image))
+        score += stretch(target, image)
         best = min(best, score)
-        bent = _BENT * fmap.curvature_difference(source, target, end[0]) if search else 0.0
-        tried.append((score + bent, *one))
-        if len(tried) >= 2 + len(maps) and best < _FOUND:
+        if search:
+            score += _CURVATURE_WEIGHT * fmap.curvature_difference(source, target, match)
+        scored.append((score, *candidate))
+        if len(scored) >= 2 + len(maps) and best < _MAX_SCORE:
             break
-    return min(tried, key=lambda one: one[0])[1:]
+    return min(scored, key=lambda row: row[0])[1:]
 
 
 def _map_from_landmarks(source, target, k):
-    """Name, initial map and its fit ``(k, k)`` of wave kernels and three landmarks."""
+    """Name, initial map and fit ``(k, k)`` from wave kernels around three or more landmarks."""
     landmarks = corresponding_landmarks(source, target)
     if len(landmarks[0]) < 3:
         return []
@@ -207,17 +207,17 @@ def _map_from_landmarks(source, target, k):
 def maps_from_signatures(
     source: Basis, target: Basis, k: int, search: bool
 ) -> Iterator[tuple[str, Array, Array]]:
-    """Name, initial map and its fit ``(k, k)`` of heat and of wave kernels, and of a search more.
+    """Yield name, initial map and fit ``(k, k)`` for heat and wave kernels, and those of a search.
 
-    The search begins with wave kernels and extremities as landmarks.
+    The search begins with wave kernels around extremities.
     """
     for kind in ("hks", "wks"):
         fitted = fmap.fmap_from_descriptors(source, target, k=k, kind=kind)
         yield kind, fmap.refine_once(source, target, fitted), fitted
     if not search:
         return
-    for i, ends in enumerate(paired_extremities(source, target)):
-        fitted = fmap.fmap_from_descriptors(source, target, k=k, landmarks=ends)
+    for i, landmarks in enumerate(paired_extremities(source, target)):
+        fitted = fmap.fmap_from_descriptors(source, target, k=k, landmarks=landmarks)
         yield f"extremities {i + 1}", fmap.refine_once(source, target, fitted), fitted
     for kind, share, oriented in SEARCHED:
         size = min(max(4, round(share * k)), source.k, target.k)
@@ -232,23 +232,23 @@ def maps_from_signatures(
 
 
 def extremities(basis: Basis, n: int) -> tuple[Array, Array]:
-    """Vertices that lie as far as possible from each other along the edges, as hands and feet do.
+    """Return geodesic farthest points, such as hands and feet, on the component of the first.
 
-    The first is the farthest from the middle.  What is not connected with it is never taken.
+    The first is the farthest from the centre.
 
     Returns
     -------
     vertex : int ndarray (n,)
     distance : float ndarray (n, n)
-        Between them along the edges.
+        Path lengths between them along the edges.
     """
 
     def distance_from(vertex: int) -> Array:
         d = dijkstra(basis.graph, indices=vertex)
         return np.where(np.isfinite(d), d, 0.0)
 
-    from_middle = ((basis.X - basis.area @ basis.X) ** 2).sum(1)
-    vertices = [int(distance_from(int(from_middle.argmin())).argmax())]
+    from_centre = ((basis.X - basis.area @ basis.X) ** 2).sum(1)
+    vertices = [int(distance_from(int(from_centre.argmin())).argmax())]
     rows = [distance_from(vertices[0])]
     while len(vertices) < n:
         vertices.append(int(np.min(rows, axis=0).argmax()))
@@ -257,57 +257,56 @@ def extremities(basis: Basis, n: int) -> tuple[Array, Array]:
 
 
 def paired_extremities(source: Basis, target: Basis) -> list[tuple[Array, Array]]:
-    """Extremities of the source and of the target ``(5,)``: the likeliest ways to pair them.
+    """Return the best pairings of extremities of source and target ``(5,)``.
 
-    Five of one are some of seven of the other, both ways, and the likelier the better the distances
-    along the edges agree, by the sum of their differences.  A shape that nearly is its own mirror
-    image has several ways that are as good.
+    Five of one shape are matched to five of seven of the other, in both directions.  The cost is
+    the sum of the differences of geodesic distances.  A nearly symmetric shape has several good
+    pairings.
     """
     ends = [extremities(basis, N_ENDS_OTHER) for basis in (source, target)]
     chosen = np.array(list(itertools.permutations(range(N_ENDS_OTHER), N_ENDS)))  # (p, 5)
-    found = []
+    costs = []
     for (few, D), (many, E) in (ends, ends[::-1]):
         D = D[:N_ENDS, :N_ENDS]
         cost = np.abs(D - E[chosen[:, :, None], chosen[:, None, :]]).sum((1, 2)) / D.sum()
-        for way in np.argsort(cost, kind="stable")[:N_PAIRED]:
-            pair = few[:N_ENDS], many[chosen[way]]
-            found.append((cost[way], pair if few is ends[0][0] else pair[::-1]))
-    ways = {}  # by what is paired, as both directions find some ways
-    for _, (a, b) in sorted(found, key=lambda one: one[0]):
-        ways.setdefault(frozenset(zip(a.tolist(), b.tolist(), strict=True)), (a, b))
-    return list(ways.values())[:N_PAIRED]
+        for row in np.argsort(cost, kind="stable")[:N_PAIRED]:
+            pair = few[:N_ENDS], many[chosen[row]]
+            costs.append((cost[row], pair if few is ends[0][0] else pair[::-1]))
+    pairings = {}  # both directions find some of them
+    for _, (a, b) in sorted(costs, key=lambda pairing: pairing[0]):
+        pairings.setdefault(frozenset(zip(a.tolist(), b.tolist(), strict=True)), (a, b))
+    return list(pairings.values())[:N_PAIRED]
 
 
 def _have_signatures(source, target, k):
-    """Whether the first k eigenvalues of both, less those of 0, have a range in common.
+    """Whether the positive ones of the first k eigenvalues of both shapes overlap in range.
 
-    Those of a surface in many pieces may be 0 all.
+    A surface with many components may have only eigenvalues 0.
     """
-    ends = (source.eigenvalue, target.eigenvalue)
-    least = max(value[value > 0].min(initial=np.inf) for value in ends)
-    return bool(1.01 * least < min(value[k - 1] for value in ends))
+    spectra = (source.eigenvalue, target.eigenvalue)
+    least = max(value[value > 0].min(initial=np.inf) for value in spectra)
+    return bool(1.01 * least < min(value[k - 1] for value in spectra))
 
 
 def initial_map(
     source: Basis, target: Basis, transform: RigidTransform, *, search: bool = False, **options: Any
 ) -> _InitialMap:
-    """:func:`map_after_alignment`, or :func:`best_initial_map` where poses are far apart.
+    """Compute an initial map: :func:`map_after_alignment`, or the best of several if poses differ.
 
-    The latter only where `init` is dense and there are signatures, ``_have_signatures``.
+    :func:`best_initial_map` needs ``init="dense"`` and signatures.
 
     Parameters
     ----------
     source, target, transform : see :func:`map_after_alignment`
     search : bool
-        See :func:`best_initial_map`; for pairs alone, as Consistent ZoomOut mends those of a
+        See :func:`best_initial_map`; for single pairs, as Consistent ZoomOut corrects the maps of a
         network.
     **options
-        Of :func:`map_after_alignment`; maps of far poses, which are looked for in other ways, take
-        all vertices.
+        Options of :func:`map_after_alignment`; `n_samples` is ignored if poses differ.
     """
-    first = map_after_alignment(source, target, transform, **options)
-    far = first.name == "dense" and spectral_icp.far_apart(source, target, first.near)
-    if not (far and _have_signatures(source, target, len(first.C))):
-        return first
-    name, C, fitted = best_initial_map(source, target, first.C, first.fitted, search=search)
-    return _InitialMap(name, C, fitted, first.near, None)
+    initial = map_after_alignment(source, target, transform, **options)
+    differ = initial.name == "dense" and spectral_icp.poses_differ(source, target, initial.near)
+    if not (differ and _have_signatures(source, target, len(initial.C))):
+        return initial
+    name, C, fitted = best_initial_map(source, target, initial.C, initial.fitted, search=search)
+    return _InitialMap(name, C, fitted, initial.near, None)

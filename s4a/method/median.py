@@ -6,7 +6,7 @@ import xarray as xr
 from s4a.method.pca import gram_pca
 from s4a.schema import Array, dataset, require
 
-# |(Lambda^0)^a (D - I) (Lambda^0)^-b|_F: the powers a and b of each reading of eq. 5's norm
+# |(Lambda^0)^a (D - I) (Lambda^0)^-b|_F: powers a and b of each interpretation of the norm of eq. 5
 NORMS = {
     "h2": (0.0, 1.0),
     "h1": (0.0, 0.5),
@@ -17,17 +17,32 @@ NORMS = {
 
 
 def area_differences(Y: Array) -> Array:
-    """D_i = Y_i^T Y_i ``(n, m, m)``: how each shape's areas differ from the latent mean.
+    """Return the area-based shape differences D_i = Y_i^T Y_i ``(n, m, m)`` from the latent mean.
 
-    After Huang et al. (2019); Y ``(n, k, m)`` are the consistent latent bases.
+    Y ``(n, k, m)`` are the consistent latent bases.
+
+    See Also
+    --------
+    conformal_differences : Conformal shape differences.
+
+    References
+    ----------
+    Rustamov, R. et al. (2013). Map-based exploration of intrinsic shape differences and
+    variability. ACM TOG 32(4).
+    Huang, R. et al. (2019). Limit shapes: a tool for understanding shape differences and
+    variability in 3D model collections. Computer Graphics Forum 38(5).
     """
     return np.einsum("nkl,nkm->nlm", Y, Y)
 
 
 def conformal_differences(Y: Array, eigenvalues: Array, latent_eigenvalue: Array) -> Array:
-    """(Lambda^0)^+ Y_i^T Lambda_i Y_i ``(n, m, m)``: how Dirichlet energies differ.
+    """Return the conformal shape differences (Lambda^0)^+ Y_i^T Lambda_i Y_i ``(n, m, m)``.
 
-    Constant modes are zero.
+    They compare Dirichlet energies.  Rows and columns of constant functions are zero.
+
+    See Also
+    --------
+    area_differences : Area-based shape differences, with references.
     """
     D = np.einsum("nkl,nk,nkm->nlm", Y, eigenvalues[:, : Y.shape[1]], Y)
     constant = _constant_eigenfunctions(latent_eigenvalue)
@@ -37,56 +52,53 @@ def conformal_differences(Y: Array, eigenvalues: Array, latent_eigenvalue: Array
 
 
 def inverse(latent_eigenvalue: Array, power: float = 1.0) -> Array:
-    """Diagonal ``(m,)`` of ((Lambda^0)^+)^power, whose powers may be negative.
-
-    Constant modes map to 0.
-    """
+    """Return the diagonal ``(m,)`` of ((Lambda^0)^+)^power, 0 for constant functions."""
     constant = _constant_eigenfunctions(latent_eigenvalue)
     return np.where(constant, 0.0, np.where(constant, 1.0, latent_eigenvalue) ** -power)
 
 
 def _constant_eigenfunctions(latent_eigenvalue):
-    """Which latent functions are constant on every component, ``(m,)``: one for each component."""
+    """Mask of the latent functions that are constant on every component ``(m,)``."""
     constant = latent_eigenvalue < 1e-6 * np.max(latent_eigenvalue, initial=0.0)
     constant[:1] = True
     return constant
 
 
 def distance_to_identity(D: Array, latent_eigenvalue: Array, norm: str = "h2") -> Array:
-    """E(M_i) = |D_i - I| of eq. 5 ``(n,)``.
+    """Return the distances to the limit shape, E(M_i) = |D_i - I| of eq. 5 ``(n,)``.
 
-    The paper writes the norm of H_0^2, in which |f| = |Lambda^0 f|, and does not say of what D - I
-    is an operator.  ``"h2"`` is our reading: the Hilbert-Schmidt norm of D - I from H_0^2 to L^2,
-    |(D - I) (Lambda^0)^+|_F, in which fine detail weighs less.  ``"h1"`` takes the square root of
-    the inverse, ``"frobenius"`` none.  ``"h2_image"`` goes from L^2 to H_0^2, |Lambda^0 (D - I)|_F,
-    in which fine detail weighs more, and ``"h2_both"`` from H_0^2 to itself,
-    |Lambda^0 (D - I) (Lambda^0)^+|_F.  Constant modes, one for each component of the surface, are
-    left out.
+    The paper writes the norm of H_0^2, in which |f| = |Lambda^0 f|, but not the spaces between
+    which D - I maps.  ``"h2"``, S4A's interpretation, is the Hilbert-Schmidt norm from H_0^2 to
+    L^2, |(D - I) (Lambda^0)^+|_F, with less weight on fine detail.  ``"h1"`` takes the square root
+    of the inverse, ``"frobenius"`` none.  ``"h2_image"`` is the norm from L^2 to H_0^2,
+    |Lambda^0 (D - I)|_F, with more weight on fine detail, and ``"h2_both"`` that from H_0^2 to
+    itself, |Lambda^0 (D - I) (Lambda^0)^+|_F.  Constant functions, one per component of the
+    surface, are excluded.
     """
     if norm not in NORMS:
-        raise ValueError(f"norm must be one of {', '.join(NORMS)}, found {norm!r}")
-    of_image, of_argument = NORMS[norm]
-    weighted = (D - np.eye(D.shape[1])) * inverse(latent_eigenvalue, of_argument)  # (n, m, m)
-    weighted = inverse(latent_eigenvalue, -of_image)[:, None] * weighted
+        raise ValueError(f"norm must be one of {', '.join(NORMS)}; found {norm!r}")
+    power_image, power_argument = NORMS[norm]
+    weighted = (D - np.eye(D.shape[1])) * inverse(latent_eigenvalue, power_argument)  # (n, m, m)
+    weighted = inverse(latent_eigenvalue, -power_image)[:, None] * weighted
     varying = ~_constant_eigenfunctions(latent_eigenvalue)
     return np.linalg.norm(weighted[:, varying][:, :, varying], axis=(1, 2))
 
 
 def difference_pca(D: Array) -> tuple[Array, Array]:
-    """PCA of vectorised operators ``(n, m, m)`` (3.6).
+    """Return PCA scores ``(n, n - 1)`` and variance ratios ``(n - 1,)`` of operators (3.6).
 
-    Scores ``(n, n - 1)`` in the unit of the operators and shares of variance ``(n - 1,)``.
+    PCA of vectorised operators ``(n, m, m)``, with scores in their unit.
     """
     n, m = D.shape[:2]
     modes = gram_pca(D, np.ones(m))
-    # gram_pca measures by the mean over the m rows, the operators' norm by their sum
+    # gram_pca averages over the m rows, the norm of operators sums over them
     score = modes.score * modes.standard_deviation * np.sqrt(m)  # (n, c)
-    empty = n - 1 - len(modes.ratio)  # components without variance
-    return np.pad(score, ((0, 0), (0, empty))), np.pad(modes.ratio, (0, empty))
+    n_empty = n - 1 - len(modes.ratio)  # components without variance
+    return np.pad(score, ((0, 0), (0, n_empty))), np.pad(modes.ratio, (0, n_empty))
 
 
 def median_shape(latent: xr.Dataset, eigenvalues: Array, *, norm: str = "h2") -> xr.Dataset:
-    """Shape differences of a collection, its distances to the limit shape, and the median (eq. 5).
+    """Compute shape differences, distances to the limit shape, and the median shape (eq. 5).
 
     Parameters
     ----------
@@ -102,6 +114,10 @@ def median_shape(latent: xr.Dataset, eigenvalues: Array, *, norm: str = "h2") ->
     xarray.Dataset
         `latent` with ``area_difference``, ``conformal_difference``, ``distance_to_limit``, the PCA
         scores of both operators, and the attributes ``median`` (name of the shape) and ``norm``.
+
+    See Also
+    --------
+    s4a.refine_network : Computes the latent bases and calls this function.
     """
     require(latent, "latent_basis", "latent_eigenvalue", what="latent dataset")
     Y, latent_eigenvalue = latent["latent_basis"].values, latent["latent_eigenvalue"].values
@@ -124,9 +140,9 @@ def median_shape(latent: xr.Dataset, eigenvalues: Array, *, norm: str = "h2") ->
 
 
 def near_ties(distance: Array, *, within: float = 0.05) -> list[int]:
-    """Indices of the shapes at most the share `within` farther than the nearest, nearest first.
+    """Return the indices of shapes within a factor 1 + `within` of the least distance, ascending.
 
-    More than one says that the median is a choice among near equals.
+    If there are several, the choice of the median is ambiguous.
 
     Examples
     --------

@@ -1,8 +1,8 @@
-"""Principal modes of the displacements (6.1, Fig. 4 and 5): PCA, and new shapes from scores.
+"""Modes of variation of the displacements (6.1, Fig. 4 and 5): PCA, and shapes from scores.
 
-There are far fewer shapes s than vertices n, so that PCA works on the Gram matrix ``(s, s)`` of the
-displacements and costs next to nothing on large meshes.  It is added up over blocks of vertices, so
-that little more memory is needed than the modes have themselves: fields in files are read in parts.
+There are far fewer shapes s than vertices n, so PCA uses the Gram matrix ``(s, s)`` of the
+displacements, which is fast for large meshes.  The matrix is summed over blocks of vertices, and
+fields in files are read in parts, so memory is little more than that of the modes.
 """
 
 from collections.abc import Iterator
@@ -16,11 +16,11 @@ from s4a.method.deform import normal_displacement, smoother
 from s4a.schema import Array, check_type, dataset, in_unit, require, unit_of
 
 BLOCK = 2**24  # numbers of all fields in a block of vertices: 128 MiB
-N_READ = 8  # blocks that are read from files at once, in single precision as they are there
+N_READ = 8  # blocks that are read from files at once, in single precision
 
 
 class _PrincipalModes(NamedTuple):
-    """What :func:`gram_pca` finds in s fields: c modes, c at most s - 1.
+    """Modes of variation of s fields: c modes, c at most s - 1.
 
     ``mean (n, d)``; ``deformation (c, n, d)`` of one standard deviation along each mode;
     ``standard_deviation (c,)``, its area-weighted root mean square; ``score (s, c)``, uncorrelated
@@ -35,14 +35,15 @@ class _PrincipalModes(NamedTuple):
 
 
 def gram(fields: Array | xr.Variable, area: Array, mean: Array | None = None) -> Array:
-    """Inner products of fields ``(s, n, d)`` under the areas scaled to sum 1, ``(s, s)``.
+    """Return the area-weighted inner products ``(s, s)`` of fields ``(s, n, d)``.
 
     Parameters
     ----------
     fields : float ndarray or variable (s, n, d)
     area : float ndarray (n,)
+        Scaled to sum 1.
     mean : float ndarray (n, d), optional
-        Taken from each field.
+        Subtracted from each field.
 
     Examples
     --------
@@ -54,14 +55,15 @@ def gram(fields: Array | xr.Variable, area: Array, mean: Array | None = None) ->
     weight = np.sqrt(area / area.sum())[:, None]
     K = np.zeros((len(fields), len(fields)))
     for block, values in parts(fields):
-        part = values if mean is None else values - mean[block]
-        rows = (np.asarray(part, np.float64) * weight[block]).reshape(len(fields), -1)  # (s, b d)
+        centered = values if mean is None else values - mean[block]
+        rows = np.asarray(centered, np.float64) * weight[block]
+        rows = rows.reshape(len(fields), -1)  # (s, b d)
         K += rows @ rows.T
     return K
 
 
 def blocks(shape: tuple[int, ...]) -> Iterator[slice]:
-    """Vertices of fields ``(s, n, d)`` in blocks of at most :data:`BLOCK` numbers.
+    """Yield the vertices of fields ``(s, n, d)`` in blocks of at most :data:`BLOCK` numbers.
 
     Examples
     --------
@@ -76,39 +78,40 @@ def blocks(shape: tuple[int, ...]) -> Iterator[slice]:
 
 
 def parts(fields: Array | xr.Variable) -> Iterator[tuple[slice, Array]]:
-    """The :func:`blocks` of fields ``(s, n, d)`` and their values, of files read some at a time."""
-    own = list(blocks(fields.shape))
-    for i in range(0, len(own), N_READ):
-        begin = own[i].start
-        several = fields[:, begin : own[min(i + N_READ, len(own)) - 1].stop]
-        values = several.values if isinstance(several, xr.Variable) else several
-        for block in own[i : i + N_READ]:
+    """Yield the :func:`blocks` of fields ``(s, n, d)`` and their values, read in parts."""
+    slices = list(blocks(fields.shape))
+    for i in range(0, len(slices), N_READ):
+        part = slices[i : i + N_READ]
+        begin = part[0].start
+        values = fields[:, begin : part[-1].stop]
+        values = values.values if isinstance(values, xr.Variable) else values
+        for block in part:
             yield block, values[:, block.start - begin : block.stop - begin]
 
 
 def center_gram(K: Array) -> Array:
-    """Gram matrix ``(s, s)`` of the fields less their mean, from that of the fields."""
+    """Centre a Gram matrix ``(s, s)``, as if the mean were subtracted from the fields."""
     return K - K.mean(0) - K.mean(1)[:, None] + K.mean()
 
 
 def principal_components(K: Array) -> tuple[Array, Array]:
-    """Variances ``(c,)`` and unit eigenvectors ``(s, c)`` of a Gram matrix, largest first.
+    """Return variances ``(c,)`` and unit eigenvectors ``(s, c)`` of a Gram matrix, largest first.
 
     The matrix is centred first.  The divisor of the variances is s - 1; components without variance
-    (below 1e-12 of the largest) are left out.
+    (below 1e-12 of the largest) are omitted.
 
     See Also
     --------
-    sklearn.decomposition.KernelPCA : what computes them; imported here, as it takes 0.2 s.
+    sklearn.decomposition.KernelPCA : The implementation.
     """
-    from sklearn.decomposition import KernelPCA
+    from sklearn.decomposition import KernelPCA  # here, as the import takes 0.2 s
 
     fitted = KernelPCA(kernel="precomputed", eigen_solver="dense").fit(K)
     return fitted.eigenvalues_ / (len(K) - 1), fitted.eigenvectors_
 
 
 def gram_pca(fields: Array | xr.Variable, area: Array) -> _PrincipalModes:
-    """PCA of fields under the inner product of the vertex areas.
+    """PCA of fields under the area-weighted inner product.
 
     Parameters
     ----------
@@ -119,8 +122,8 @@ def gram_pca(fields: Array | xr.Variable, area: Array) -> _PrincipalModes:
 
     Returns
     -------
-    PrincipalModes
-        Of the precision of the fields.  Their signs make the third moment of the scores positive.
+    _PrincipalModes
+        In the precision of the fields.  Signs are chosen for a positive third moment of the scores.
     """
     s = len(fields)
     mean = np.concatenate([values.mean(axis=0) for _, values in parts(fields)])
@@ -128,8 +131,7 @@ def gram_pca(fields: Array | xr.Variable, area: Array) -> _PrincipalModes:
     V = V * np.where((V**3).sum(0) < 0, -1.0, 1.0)  # (s, c)
     deformation = np.empty((V.shape[1], *mean.shape), np.result_type(fields.dtype, np.float32))
     for block, values in parts(fields):
-        part = values - mean[block]
-        modes = np.einsum("sc,snd->cnd", V, part, optimize=True)
+        modes = np.einsum("sc,snd->cnd", V, values - mean[block], optimize=True)
         modes /= np.sqrt(s - 1)
         deformation[:, block] = modes
     ratio = variance / variance.sum()
@@ -137,24 +139,23 @@ def gram_pca(fields: Array | xr.Variable, area: Array) -> _PrincipalModes:
 
 
 def low_vertices(coarse: xr.Dataset) -> Array:
-    """For every coarse vertex the original vertex in which U weighs it most ``(n_coarse,)``.
+    """Return for every coarse vertex the original vertex with its largest weight ``(n_coarse,)``.
 
-    Of SCALABLE the vertex that the sample is.
+    In SCALABLE the vertex of the sample.
     """
     if "local_weight" in coarse:
         return coarse["sample_vertex"].values
     vertex = coarse["coarse_vertex"].values  # (n, 3)
     order = np.argsort(coarse["coarse_weight"].values.ravel(), kind="stable")
     heaviest = np.zeros(coarse.sizes["vertex"], np.int64)
-    heaviest[vertex.ravel()[order]] = order // vertex.shape[1]  # the last one written stays
+    heaviest[vertex.ravel()[order]] = order // vertex.shape[1]  # the last write wins
     return heaviest
 
 
 def _smooth_low(d, coarse, *, area_weighted=True):
-    """Displacements at low resolution ``(s, n_coarse, 3)``, smoothed as those at full: Phi Phi^+ d.
+    """Smoothed low-resolution displacements Phi Phi^+ d ``(s, n_coarse, 3)``.
 
-    The line after eq. 8 without U, in the eigenfunctions of the coarse mesh, so that Fig. 5
-    compares resolutions and not smoothings.
+    The line after eq. 8 without U, so that Fig. 5 compares resolutions with equal smoothing.
 
     Parameters
     ----------
@@ -162,11 +163,11 @@ def _smooth_low(d, coarse, *, area_weighted=True):
     coarse : xarray.Dataset
         With ``eigenfunction`` and ``vertex_area``.
     area_weighted : bool
-        Whether vertices weigh by their areas, see :func:`s4a.analyse`.
+        Whether to weight vertices by area, see :func:`s4a.analyse`.
     """
     Phi, area = coarse["eigenfunction"].values, coarse["vertex_area"].values
     coefficients = smoother(Phi, area / area.sum() if area_weighted else np.ones(len(area)))
-    return np.stack([Phi @ coefficients(one) for one in d.astype(float)])
+    return np.stack([Phi @ coefficients(field) for field in d.astype(float)])
 
 
 def pca(
@@ -176,7 +177,7 @@ def pca(
     coarse: xr.Dataset | None = None,
     area_weighted: bool = True,
 ) -> xr.Dataset:
-    """Principal modes of a registered collection (6.1, Fig. 4 and 5).
+    """Compute the modes of variation of a registered collection (6.1, Fig. 4 and 5).
 
     Parameters
     ----------
@@ -185,11 +186,11 @@ def pca(
     area : float ndarray (vertex,)
         Template vertex areas, the weights of the Gram matrix.
     coarse : xarray.Dataset, optional
-        The template's low-resolution mesh; gives the shares of variance at low resolution as well,
-        where the registration has ``displacement_low``.  They are of the matches of eq. 6, smoothed
-        by ``_smooth_low`` as those at full resolution are, and beside them of the matches as
-        they are.
-    area_weighted : see ``_smooth_low``
+        The template's low-resolution mesh, for variance shares at low resolution if the
+        registration has ``displacement_low``: of the matches of eq. 6, smoothed as at full
+        resolution, and unsmoothed.
+    area_weighted : bool
+        Whether the smoothing weights vertices by area, see :func:`s4a.analyse`.
 
     Returns
     -------
@@ -201,17 +202,21 @@ def pca(
     Raises
     ------
     ValueError
-        With fewer than 3 shapes, when a displacement is not finite, or when all are equal: there
-        is no variation to analyse.
+        If there are fewer than 3 shapes, or displacements are not finite or all equal.
+
+    See Also
+    --------
+    s4a.synthesize : Reconstruct a shape from scores.
+    project_scores : Scores of other displacements.
     """
     require(registration, "displacement", what="registration")
     d = registration["displacement"].transpose("shape", "vertex", "xyz").variable
     if len(d) < 3:
-        raise ValueError(f"PCA needs at least 3 shapes, found {len(d)}")
-    broken = ~np.array([np.isfinite(d[i].values).all() for i in range(len(d))])
-    if broken.any():
-        which = ", ".join(map(str, registration["shape"].values[broken]))
-        raise ValueError(f"PCA needs displacements that are finite; leave out {which}")
+        raise ValueError(f"PCA needs at least 3 shapes; found {len(d)}")
+    invalid = ~np.array([np.isfinite(d[i].values).all() for i in range(len(d))])
+    if invalid.any():
+        names = ", ".join(map(str, registration["shape"].values[invalid]))
+        raise ValueError(f"PCA needs finite displacements; leave out {names}")
     modes = gram_pca(d, area)
     size = 1.0
     if "position" in registration:
@@ -232,7 +237,7 @@ def pca(
             np.pad(gram_pca(fields, coarse["vertex_area"].values).ratio, (0, len(d)))
             for fields in (smooth, low)
         )
-        c = len(modes.ratio)  # as many as at full
+        c = len(modes.ratio)  # as many as at full resolution
         low_ratios = dataset(
             explained_variance_ratio_low=smooth_ratio[:c],
             explained_variance_ratio_raw=raw_ratio[:c],
@@ -243,14 +248,14 @@ def pca(
 
 
 def synthesize(study: xr.DataTree, scores: Array) -> xr.Dataset:
-    """The shape with given scores: template + mean displacement + sum of score times deformation.
+    """Reconstruct the shape of given scores: mean shape plus the sum of scores times deformations.
 
     Parameters
     ----------
     study : xarray.DataTree
         With ``/registration`` and ``/pca``.
     scores : array_like (c,)
-        In standard deviations, for the first c components.
+        Scores of the first c components, in standard deviations.
 
     Returns
     -------
@@ -261,11 +266,21 @@ def synthesize(study: xr.DataTree, scores: Array) -> xr.Dataset:
     Raises
     ------
     ValueError
-        When there are more scores than components, or the study has no modes.
+        If there are more scores than components, or the study has no PCA.
+
+    See Also
+    --------
+    s4a.method.pca.pca : Compute the modes.
+    s4a.explore : Change the scores interactively.
+
+    References
+    ----------
+    Cootes, T. F. et al. (1995). Active shape models: their training and application. Computer
+    Vision and Image Understanding 61(1).
 
     Examples
     --------
-    With the ``study`` of six small brains; scores of 0 give the mean shape:
+    In a study of six small brains, scores of 0 give the mean shape:
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
@@ -274,7 +289,7 @@ def synthesize(study: xr.DataTree, scores: Array) -> xr.Dataset:
     >>> bool(abs(moved - study["pca"]["deformation"][0].values).max() < 1e-4)
     True
 
-    The first mode of five larger ones:
+    The first mode of variation of five larger brains:
 
     >>> brains = s4a.synthetic.brains(5, 3000)
     >>> larger = s4a.analyse(brains, n_coarse=500, k=40, intersections=False)
@@ -287,13 +302,13 @@ def synthesize(study: xr.DataTree, scores: Array) -> xr.Dataset:
     if "pca" not in study.children:
         reason = study["report"].attrs.get("no_modes") if "report" in study.children else ""
         raise ValueError(
-            f"a study with modes is needed; this one has none: {reason or 'it is not finished'}"
+            f"a study with /pca is needed; this one has none: {reason or 'it is not finished'}"
         )
     modes = study["pca"].to_dataset()
     require(modes, "deformation", "mean_displacement", what="pca dataset")
     if scores.ndim != 1 or len(scores) > modes.sizes["component"]:
         raise ValueError(
-            f"scores need at most {modes.sizes['component']} numbers, found shape {scores.shape}"
+            f"scores need at most {modes.sizes['component']} numbers; found shape {scores.shape}"
         )
     template = study["registration"].to_dataset()
     mean = template["position"].values + modes["mean_displacement"].values
@@ -303,7 +318,7 @@ def synthesize(study: xr.DataTree, scores: Array) -> xr.Dataset:
 
 
 def apply_scores(mean: Array, deformation: Array, scores: Array) -> Array:
-    """The mean shape ``(n, 3)`` moved by the scores ``(c,)`` along the deformations ``(c, n, 3)``.
+    """Return the mean shape ``(n, 3)`` plus scores ``(c,)`` times deformations ``(c, n, 3)``.
 
     Examples
     --------
@@ -318,7 +333,7 @@ def apply_scores(mean: Array, deformation: Array, scores: Array) -> Array:
 
 
 def mahalanobis(scores: Array) -> float:
-    """Mahalanobis distance of a shape from the mean: the length of its scores, of unit variance.
+    """Return the Mahalanobis distance of a shape from the mean: the norm of its scores.
 
     Examples
     --------
@@ -330,7 +345,7 @@ def mahalanobis(scores: Array) -> float:
 
 
 def plausible_scores(n: int, *, seed: int | None = None, limit: float = 3.0) -> Array:
-    """Scores ``(n,)`` of a random shape: normal, those beyond the limit drawn again.
+    """Draw scores ``(n,)`` of a random shape from a normal distribution truncated at the limit.
 
     Examples
     --------
@@ -348,10 +363,10 @@ def plausible_scores(n: int, *, seed: int | None = None, limit: float = 3.0) -> 
 def color_limits(
     mean: Array, triangles: Array, deformation: Array, *, sigma: float = 3, n_modes: int = 3
 ) -> tuple[float, float]:
-    """Displacements of the full colours: along the normal, and in length.
+    """Return the colour limits of displacements: along the normal, and in length.
 
-    The 95 % quantile over the vertices and the first modes at `sigma` standard deviations: one
-    scale for all modes, on which a few outlying vertices do not count.
+    The 95 % quantile over vertices and the first modes at `sigma` standard deviations, which is one
+    scale for all modes and robust to outlying vertices.
     """
     steps = deformation[:n_modes]  # (c, n, 3)
     along = np.quantile(np.abs(normal_displacement(steps, vertex_normals(mean, triangles))), 0.95)
@@ -362,75 +377,76 @@ def color_limits(
 def project_scores(
     d: Array, mean: Array, deformation: Array, standard_deviation: Array, area: Array
 ) -> tuple[Array, Array]:
-    """Scores of displacements on given modes, and what the modes leave.
+    """Project displacements onto given modes: scores and residuals.
 
     Parameters
     ----------
     d : float ndarray (s, n, 3)
     mean : (n, 3), deformation : (c, n, 3), standard_deviation : (c,)
-        As of :func:`gram_pca`.
+        Modes of :func:`gram_pca`.
     area : float ndarray (n,)
 
     Returns
     -------
     score : (s, c), in standard deviations
-    residual : (s,), root mean square over the area of what is left
+    residual : (s,), area-weighted root mean square of the residual
     """
     w = area / area.sum()
     scores, residuals = [], []
-    for field in d:  # one by one, so that the last digit does not depend on the others
+    for field in d:  # separately, so that the last digit does not depend on the other shapes
         x = np.asarray(field, float) - mean
         along = np.einsum("cnx,nx->c", deformation, x * w[:, None], optimize=True)
         score = along / standard_deviation**2
         total = np.einsum("nx,nx,n->", x, x, w, optimize=True)
-        left = total - ((score * standard_deviation) ** 2).sum()
+        squared = total - ((score * standard_deviation) ** 2).sum()
         scores.append(score)
-        residuals.append(np.sqrt(max(left, 0.0)))
+        residuals.append(np.sqrt(max(squared, 0.0)))
     return np.array(scores), np.array(residuals)
 
 
 def pca_without(
     registration: xr.Dataset,
-    apart: list[str],
+    excluded: list[str],
     coarse: xr.Dataset | None,
     *,
     area_weighted: bool = True,
 ) -> xr.Dataset:
-    """Principal modes of all but some shapes, and the scores of these on them.
+    """Compute the modes of variation without some shapes, and the scores of these shapes.
 
     Parameters
     ----------
     registration : xarray.Dataset
-        With ``vertex_area`` and what :func:`pca` needs.
-    apart : list of str
-        Shapes of which the modes know nothing.
+        With ``vertex_area`` and the variables that :func:`pca` needs.
+    excluded : list of str
+        Shapes that do not contribute to the modes.
     coarse, area_weighted : see :func:`pca`
 
     Returns
     -------
     xarray.Dataset
-        Of :func:`pca`; where there are shapes apart, also ``score_excluded(shape_excluded,
-        component)``.
+        Result of :func:`pca`, with ``score_excluded(shape_excluded, component)`` if shapes are
+        excluded.
 
     Raises
     ------
     ValueError
-        As of :func:`pca`.
+        As for :func:`pca`.
     """
     area = registration["vertex_area"].values
-    names = [name for name in registration["shape"].values.tolist() if name not in apart]
+    names = [name for name in registration["shape"].values.tolist() if name not in excluded]
     try:
-        chosen = registration.sel(shape=names)
-        result = pca(chosen, area, coarse=coarse, area_weighted=area_weighted)
+        included = registration.sel(shape=names)
+        result = pca(included, area, coarse=coarse, area_weighted=area_weighted)
     except ValueError as error:
-        if not apart:
+        if not excluded:
             raise
         raise ValueError(
-            f"{error}; {len(apart)} flagged shapes are left out, include_flagged=True takes them in"
+            f"{error}; {len(excluded)} flagged shapes are excluded: include_flagged=True "
+            "includes them"
         ) from error
-    if not apart:
+    if not excluded:
         return result
     mean, deformation = result["mean_displacement"].values, result["deformation"].values
-    d, sd = registration["displacement"].sel(shape=apart), result["standard_deviation"].values
+    d, sd = registration["displacement"].sel(shape=excluded), result["standard_deviation"].values
     score, _ = project_scores(d.values, mean, deformation, sd, area)
-    return result.merge(dataset(score_excluded=score)).assign_coords(shape_excluded=apart)
+    return result.merge(dataset(score_excluded=score)).assign_coords(shape_excluded=excluded)

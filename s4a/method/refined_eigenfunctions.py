@@ -1,10 +1,9 @@
 """Eigenfunctions at full resolution from those of the low resolution (3.3, with U of 4.1).
 
-U Phi is linear over the coarse triangles, and what the coarse mesh takes for eigenfunctions.  From
-there one step of inverse iteration, W B = A U Phi Lambda with the W and A of the mesh itself,
-solved by one cycle of two grids, the coarse mesh being the other, and Rayleigh-Ritz in the span of
-B.  No eigenproblem of full size is solved, and what is not in the span of the eigenfunctions falls
-to a fifth.
+U Phi are eigenfunctions of the coarse mesh, linear over its triangles.  One step of inverse
+iteration, W B = A U Phi Lambda with W and A of the full mesh, is solved by a two-grid cycle with
+the coarse mesh, followed by Rayleigh-Ritz in the span of B.  No eigenproblem of full size is
+solved, and the part outside the span of the eigenfunctions falls to a fifth.
 """
 
 import numpy as np
@@ -19,17 +18,17 @@ from s4a.method.shape import Shape, features_of, vertices_of_landmarks
 from s4a.method.spectral import factor, spectrum, with_constant_first
 from s4a.schema import Array, dataset
 
-SPARE = 10  # functions more than are asked for: the last ones of a span are the least exact
+SPARE = 10  # additional functions, as the last ones of a span are the least accurate
 ITERATIONS = 4  # of the smoother
-LEAST = 0.05  # it acts in LEAST..1 of its spectrum 0..1; below the coarse mesh does
+LEAST = 0.05  # eigenvalue of the smoother, in 0..1, below which the coarse mesh corrects
 
 
 def smooth(
     S: sp.csr_matrix, R: Array, B: Array, iterations: int = ITERATIONS, least: float = LEAST
 ) -> Array:
-    """Chebyshev iteration for S B = R ``(n, k)``, with eigenvalues of S in 0..1, from B.
+    """Apply Chebyshev iterations for S B = R ``(n, k)``, with eigenvalues of S in 0..1, to B.
 
-    It damps what lies in least..1, and enlarges nothing.
+    Errors with eigenvalues in least..1 are damped, and no others amplified.
 
     Examples
     --------
@@ -44,27 +43,27 @@ def smooth(
     step = (R - S @ B) / np.float32(middle)
     B = B + step
     for _ in range(iterations - 1):
-        last, ratio = ratio, 1 / (2 * middle / half - ratio)
-        rest = S @ B
-        np.subtract(R, rest, out=rest)  # in place: the arrays are those of the full resolution
-        rest *= np.float32(2 * ratio / half)
-        step *= np.float32(ratio * last)
-        step += rest
+        previous, ratio = ratio, 1 / (2 * middle / half - ratio)
+        residual = S @ B
+        np.subtract(R, residual, out=residual)  # in place, as the arrays are large
+        residual *= np.float32(2 * ratio / half)
+        step *= np.float32(ratio * previous)
+        step += residual
         B += step
     return B
 
 
 def _inverse_step(W, area, U, W_coarse, area_coarse, Phi, eigenvalue):
-    r"""One cycle of two grids for W B = A (U Phi) Lambda, from B = U Phi.
+    r"""Two-grid cycle for W B = A (U Phi) Lambda, from B = U Phi.
 
     ::
 
-        smooth -- rest --> U^T         U --> add -- smooth       the mesh
-                              \       /
-                               W_c^-1                            its coarse mesh
+        smooth -- residual --> U^T         U --> add -- smooth       full mesh
+                                  \       /
+                                   W_c^-1                            coarse mesh
 
-    The smoother is Jacobi's with the row sums of |W| in the place of its diagonal, which obtuse
-    triangles do not upset.
+    The smoother is Jacobi iteration with the row sums of |W| instead of the diagonal, which is
+    stable for obtuse triangles.
 
     Parameters
     ----------
@@ -84,19 +83,19 @@ def _inverse_step(W, area, U, W_coarse, area_coarse, Phi, eigenvalue):
     U = U.astype(np.float32).tocsr()
     B = U @ Phi.astype(np.float32)  # (n, k)
     R = area.astype(np.float32)[:, None] / rows * (B * eigenvalue.astype(np.float32))
-    shift = 1e-2 * eigenvalue[eigenvalue > 0].min()  # the coarse W alone is singular
+    shift = 1e-2 * eigenvalue[eigenvalue > 0].min()  # as the coarse W is singular
     solve_coarse = factor(W_coarse + shift * sp.diags(area_coarse))
     B = smooth(S, R, B)
-    rest = U.T @ (rows * (R - S @ B))  # (n_coarse, k)
-    B = B + U @ solve_coarse(rest.astype(float)).astype(np.float32)
+    residual = U.T @ (rows * (R - S @ B))  # (n_coarse, k)
+    B = B + U @ solve_coarse(residual.astype(float)).astype(np.float32)
     return smooth(S, R, B)
 
 
 def _rayleigh_ritz(W, area, B, k):
-    """The k least eigenpairs in the span of B: eigenvalues ``(k,)`` and functions ``(n, k)``."""
+    """The k smallest eigenpairs in the span of B: eigenvalues ``(k,)`` and functions ``(n, k)``."""
     stiff = B.T @ (W.astype(B.dtype) @ B)
     mass = B.T @ (area.astype(B.dtype)[:, None] * B)
-    stiff = (stiff + stiff.T).astype(float) / 2  # symmetric in spite of rounding
+    stiff = (stiff + stiff.T).astype(float) / 2  # exactly symmetric
     mass = (mass + mass.T).astype(float) / 2
     eigenvalue, V = scipy.linalg.eigh(stiff, mass)
     return eigenvalue[:k], B @ V[:, :k].astype(B.dtype)
@@ -105,7 +104,7 @@ def _rayleigh_ritz(W, area, B, k):
 def refine_eigenfunctions(
     X: Array, T: Array, area: Array, U: sp.csr_matrix, coarse: xr.Dataset, k: int
 ) -> tuple[Array, Array]:
-    """The first k eigenfunctions of a mesh, nearly, from k or more of its coarse mesh.
+    """Approximate the first k eigenfunctions of a mesh from those of its coarse mesh.
 
     Parameters
     ----------
@@ -113,7 +112,7 @@ def refine_eigenfunctions(
         The mesh and its vertex areas, in any unit.
     U : sparse matrix (n, n_coarse)
     coarse : Dataset
-        Of :func:`s4a.spectrum`, best with k + :data:`SPARE` eigenfunctions.
+        Result of :func:`s4a.spectrum`, preferably with k + :data:`SPARE` eigenfunctions.
     k : int
 
     Returns
@@ -143,48 +142,48 @@ def refine_eigenfunctions(
     Phi, eigenvalue = coarse["eigenfunction"].values, coarse["eigenvalue"].values
     B = _inverse_step(W, area, U, stiffness(E, w, len(a)), a / a.sum(), Phi, eigenvalue)
     zero = eigenvalue == 0
-    B[:, zero] = U @ Phi[:, zero]  # the constants of the pieces are eigenfunctions as they are
+    B[:, zero] = U @ Phi[:, zero]  # constants on components are exact eigenfunctions
     n_zero = int(zero.sum())
     eigenvalue, B = _rayleigh_ritz(W, area, B, max(k, n_zero))
-    eigenvalue[:n_zero] = 0.0  # descriptors would take rounding, 1e-5, for a frequency
+    eigenvalue[:n_zero] = 0.0  # else descriptors would use the rounding error, 1e-5
     B[:, :n_zero] = with_constant_first(B[:, :n_zero], area)
     eigenvalue, B = eigenvalue[:k], B[:, :k]
-    third = np.einsum("n,nk,nk,nk->k", area.astype(B.dtype), B, B, B)  # moments: as in eigenpairs
-    B *= np.where(third < 0, -1, 1).astype(B.dtype)
+    moment = np.einsum("n,nk,nk,nk->k", area.astype(B.dtype), B, B, B)  # signs as in eigenpairs
+    B *= np.where(moment < 0, -1, 1).astype(B.dtype)
     return np.maximum(eigenvalue, 0.0), B
 
 
 def with_refined_eigenfunctions(mesh: xr.Dataset, low: xr.Dataset, k: int) -> xr.Dataset:
-    """Low-resolution mesh with k refined eigenfunctions, at coarse and at all vertices.
+    """Replace the eigenfunctions of a low-resolution mesh by k refined ones.
 
-    They are orthonormal for the areas of the low-resolution mesh, as ZoomOut needs it.
+    They are orthonormal for the areas of the low-resolution mesh, as ZoomOut requires.
 
     Parameters
     ----------
     mesh : Dataset
-        The mesh itself.
+        The full mesh.
     low : Dataset
-        Of :func:`s4a.spectrum`, best with k + :data:`SPARE` eigenfunctions.
+        Result of :func:`s4a.spectrum`, preferably with k + :data:`SPARE` eigenfunctions.
     k : int
 
     Returns
     -------
     Dataset
-        `low` with ``eigenvalue(eigenpair)`` and ``eigenfunction(vertex, eigenpair)`` in the place
-        of its own, and ``refined_eigenfunction(original_vertex, eigenpair)``.
+        `low` with other ``eigenvalue(eigenpair)`` and ``eigenfunction(vertex, eigenpair)``, and
+        with ``refined_eigenfunction(original_vertex, eigenpair)``.
     """
     shape = Shape(mesh, low)
     X, T = as_arrays(mesh)
     eigenvalue, B = refine_eigenfunctions(X, T, vertex_areas(X, T), shape.U, low, k)  # (n, k)
     vertex = low["sample_vertex"].values.copy()
     cell, nearest = np.unique(shape.cell, return_index=True)
-    # the centres of closed openings are no vertices: the first of their cells stands for them
+    # centres of closed openings are not vertices: the first vertex of the cell replaces them
     vertex[cell] = np.where(vertex[cell] < 0, nearest, vertex[cell])
     area = low["vertex_area"].values
     area = area / area.sum()
     Phi = B[vertex].astype(float)
-    turn = np.linalg.inv(np.linalg.cholesky(Phi.T @ (area[:, None] * Phi))).T
-    B = B @ turn.astype(B.dtype)
+    orthonormalise = np.linalg.inv(np.linalg.cholesky(Phi.T @ (area[:, None] * Phi))).T
+    B = B @ orthonormalise.astype(B.dtype)
     functions = dataset(
         eigenvalue=eigenvalue, eigenfunction=B[vertex].astype(float), refined_eigenfunction=B
     )
@@ -202,12 +201,13 @@ def low_resolution(
     wrap: bool = False,
     seed: int = 0,
 ) -> xr.Dataset:
-    """The low-resolution mesh with its functions: :func:`s4a.coarsen`, :func:`s4a.spectrum`.
+    """Return the low-resolution mesh with spectrum, landmarks and fields.
 
-    With `refined_eigenfunctions` also :func:`with_refined_eigenfunctions`.  With
-    ``method="scalable"`` :func:`s4a.method.scalable.reduced` is in their place, which can neither
-    be lifted nor wrapped.  Of landmarks that guide it has ``guide_vertex``, the coarse vertices
-    that weigh most in U there; of fields that guide their means by the weights of U.
+    :func:`s4a.coarsen`, :func:`s4a.spectrum` and, with `refined_eigenfunctions`,
+    :func:`with_refined_eigenfunctions`; with ``method="scalable"``
+    :func:`s4a.method.scalable.reduced`, without refinement or wrapping.  ``guide_vertex`` are the
+    coarse vertices with the largest weight in U at landmarks.  Fields are averaged with the weights
+    of U.
     """
     if method == "scalable":
         low = reduced(mesh, n_coarse=n_coarse, k=k, seed=seed)
@@ -220,7 +220,7 @@ def low_resolution(
         vertex = shape.cell[list(landmarks.values())]
         low = low.merge(dataset(guide_name=list(landmarks), guide_vertex=vertex))
     if fields:
-        values = np.stack([_mean_over_cells(shape, one) for one in fields.values()], axis=1)
+        values = np.stack([_mean_over_cells(shape, field) for field in fields.values()], axis=1)
         weights = mesh["feature_weight"].values
         names = list(fields)
         low = low.merge(dataset(feature_name=names, feature_value=values, feature_weight=weights))
@@ -228,9 +228,9 @@ def low_resolution(
 
 
 def _mean_over_cells(shape, values):
-    """Means of a field ``(n,)`` by the weights of U ``(n_coarse,)``; NaN where none is known."""
-    known = np.isfinite(values)
-    area = np.where(known, vertex_areas(*as_arrays(shape.original)), 0)
+    """Means ``(n_coarse,)`` of a field ``(n,)`` with the weights of U, NaN if it is NaN."""
+    finite = np.isfinite(values)
+    area = np.where(finite, vertex_areas(*as_arrays(shape.original)), 0)
     total = shape.U.T @ area
     with np.errstate(invalid="ignore", divide="ignore"):
-        return (shape.U.T @ (area * np.where(known, values, 0))) / total
+        return (shape.U.T @ (area * np.where(finite, values, 0))) / total

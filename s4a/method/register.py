@@ -1,7 +1,7 @@
-"""Registration (4.2; eq. 3, 4, 6, 7, 8): one shape onto the template at full resolution, and back.
+"""Registration of one shape and the template at full resolution (4.2; eq. 3, 4, 6, 7, 8).
 
-The source is the shape M_i, the target the template, the paper's median shape: a match holds, on
-every vertex of the template, a vertex of the shape.
+The source is the shape M_i, the target the template, in the paper the median shape.  A match holds,
+at every vertex of the template, a vertex of the shape.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas
 from s4a.method import spectral_icp
 from s4a.method.deform import displacement_in_template, distortion
 from s4a.method.elastic import (
-    FOLLOWING,
+    DEFORMATION,
     STIFFNESS,
     Landmarks,
     converging_initialisations,
@@ -29,22 +29,22 @@ from s4a.method.shape import Basis, Shape
 from s4a.options import check
 from s4a.schema import INPUT, Array, dataset, in_unit
 
-RIGHT = 0.01  # share of sqrt(area): errors below are right
-LEAST = 1e-4  # added to gap and stretch: what is below is noise of the mesh
-# w_0, and those of the logarithms of gap and stretch: docs/decisions.md
+RADIUS = 0.01  # share of sqrt(area): a match with a smaller error counts as correct
+OFFSET = 1e-4  # added to distance and stretch, whose smaller values are mesh noise
+# intercept, and weights of the logarithms of distance and stretch: docs/decisions.md
 WEIGHTS = (-12.06, -1.46, -1.58)
 
 
 def stretch(X: Array, image: Array, T: Array) -> Array:
-    """How much a map stretches the triangles around every vertex ``(n,)``.
+    """Return the stretch of the triangles around every vertex under a map ``(n,)``.
 
-    The root mean square over their areas of sqrt(log(s1)^2 + log(s2)^2), s1 and s2 the singular
-    values of a triangle's linear map.
+    The area-weighted root mean square of sqrt(log(s1)^2 + log(s2)^2), where s1 and s2 are the
+    singular values of a triangle's linear map.
 
     Parameters
     ----------
     X, image : float ndarray (n, 3)
-        The vertices, and where the map takes them.
+        Vertices, and their images.
     T : int ndarray (m, 3)
 
     Examples
@@ -59,7 +59,7 @@ def stretch(X: Array, image: Array, T: Array) -> Array:
     conformal, area = distortion(X, image, T)
     before = triangle_areas(X, T)
     squared = (area**2 + conformal**2) / 2  # log(s1)^2 + log(s2)^2
-    squared = np.minimum(np.where(np.isnan(squared), 0.0, squared), 100.0)  # points, collapsed ones
+    squared = np.minimum(np.where(np.isnan(squared), 0.0, squared), 100.0)  # degenerate, collapsed
     corners = T.ravel()
     total, weight = (
         np.bincount(corners, np.repeat(values, 3), len(X)) for values in (before * squared, before)
@@ -67,51 +67,51 @@ def stretch(X: Array, image: Array, T: Array) -> Array:
     return np.sqrt(total / np.maximum(weight, np.finfo(float).tiny))
 
 
-def evidence(source: Shape, target: Shape, match: Array, P: Array) -> Array:
-    """Logarithms of gap and stretch, smooth over the template ``(n_target, 2)``.
+def confidence_features(source: Shape, target: Shape, match: Array, P: Array) -> Array:
+    """Return the logarithms of distance and stretch, smoothed on the template ``(n_target, 2)``.
 
     Parameters
     ----------
     source, target : Shape
         The shape and the template.
     match : int ndarray (n_target,)
-        Near which vertex of the shape each vertex of the template lies.
+        Vertex of the shape close to each vertex of the template.
     P : float ndarray (n_target, 3)
         The registered template, in the frame of the shape.
     """
-    X, T, near = target.full.X, target.full.T, target.near_coarse  # what is smooth is known there
+    X, T, near = target.full.X, target.full.T, target.near_coarse  # enough for smooth fields
     Y, S = source.full.X, source.full.T
-    place = closest_point_in_star(P[near], match[near], Y, S, source.full.stars)
-    gap = np.linalg.norm(P[near] - interpolate(Y, S, *place), axis=1)  # share of sqrt(area)
-    beside = np.zeros(len(X), bool)
-    beside[near] = True
-    around = T[beside[T].any(axis=1)]
-    found = np.log(np.stack([gap, stretch(X, P, around)[near]], axis=1) + LEAST)
-    return target.full.field(target.full.coefficients(found))
+    triangle, weights = closest_point_in_star(P[near], match[near], Y, S, source.full.stars)
+    distance = np.linalg.norm(P[near] - interpolate(Y, S, triangle, weights), axis=1)
+    is_near = np.zeros(len(X), bool)
+    is_near[near] = True
+    around = T[is_near[T].any(axis=1)]
+    features = np.log(np.stack([distance, stretch(X, P, around)[near]], axis=1) + OFFSET)
+    return target.full.field(target.full.coefficients(features))
 
 
 def confidence(source: Shape, target: Shape, match: Array, P: Array) -> Array:
-    """Probability ``(n_target,)`` that a vertex lies within 1 % of sqrt(area) of its true place.
+    """Estimate the probability of an error below 1 % of sqrt(area) at every vertex ``(n_target,)``.
 
     Parameters
     ----------
-    source, target, match, P : see :func:`evidence`
+    source, target, match, P : see :func:`confidence_features`
     """
     w_0, *w = WEIGHTS
-    flag = -(w_0 + evidence(source, target, match, P) @ np.array(w))
-    return 1 / (1 + np.exp(np.clip(flag, -50, 50)))
+    logit = w_0 + confidence_features(source, target, match, P) @ np.array(w)
+    return 1 / (1 + np.exp(np.clip(-logit, -50, 50)))
 
 
 def uncertainty(confidence: Array) -> Array:
-    """Root of the mean squared error of a match that is this sure, as a share of sqrt(area).
+    """Root mean squared error of matches of a given confidence, as a share of sqrt(area).
 
-    A confidence is the share of such vertices within 1 % of sqrt(area) of the truth.  Where errors
-    are Gaussian in the plane, that is 1 - exp(-0.01^2 / r^2) for the radius r.
+    A confidence is the share of such vertices with an error below 1 % of sqrt(area).  For errors
+    that are Gaussian in the plane with root mean square r it is 1 - exp(-0.01^2 / r^2).
 
     Parameters
     ----------
     confidence : ndarray (p,)
-        Below 0.1 it counts as 0.1, which is a radius of 3 %.
+        Values below 0.1 count as 0.1, an error of 3 %.
 
     Returns
     -------
@@ -124,26 +124,25 @@ def uncertainty(confidence: Array) -> Array:
     >>> uncertainty(np.array([0.1, 0.63, 1.0])).round(3).tolist()
     [0.031, 0.01, 0.003]
     """
-    return RIGHT / np.sqrt(-np.log1p(-np.clip(confidence, 0.1, 1 - 1e-6)))
+    return RADIUS / np.sqrt(-np.log1p(-np.clip(confidence, 0.1, 1 - 1e-6)))
 
 
-# |log| of the ratio of areas at the hundredth of the template that changes most, above which it may
-# lie on a wrong fold
-TORN = 0.65
-FEW = 2000  # vertices of low resolution: fewer smear tears
-_SMEARED = 0.3  # by this share of TORN
-_LOOSER = 4  # the step of elastic iterations with which they begin then, too
-# of score times tear: what looser iterations must leave at most.  Where they find the right fold
-# they leave 0.3 to 0.72; real heads 0.81 or more where the score falls at all (docs/decisions.md)
-_MENDED = 0.75
+# 99 % quantile of the |log| area ratio above which part of the template may lie on a wrong fold
+MAX_STRAIN = 0.65
+FEW = 2000  # with fewer low-resolution vertices the strain is smoothed
+_STRAIN_REDUCTION = 0.3  # share of MAX_STRAIN by which the limit is lower then
+_LESS_STIFF_STEP = 4  # first step of the less stiff elastic iterations
+# largest remaining share of score times strain after less stiff iterations.  They leave 0.3 to 0.72
+# if they find the right fold, 0.81 or more on real heads (docs/decisions.md)
+_MAX_REMAINING = 0.75
 
-Functions = tuple[Array, Array]  # of source and target, rows of which are compared
+Functions = tuple[Array, Array]  # functions of source and target, whose rows are compared
 
 
 def match_low(
     source: Shape, target: Shape, bases: Functions, *, dense_match: str = "latent"
 ) -> tuple[Array, Functions]:
-    """Match at low resolution (eq. 6), and the functions whose rows full resolution compares.
+    """Match at low resolution (eq. 6), and return the functions for the full-resolution match.
 
     Parameters
     ----------
@@ -157,7 +156,7 @@ def match_low(
     -------
     match : int ndarray (n_coarse_target,)
     functions : tuple of float ndarray (n_coarse, m)
-        At all vertices where they are lifted.
+        At all vertices if the shapes have refined eigenfunctions.
     """
     check("dense_match", dense_match)
     Y_source, Y_target = bases  # (k, m) each
@@ -166,12 +165,12 @@ def match_low(
     match = nearest_rows(Psi @ Y_target, Phi @ Y_source)  # eq. 6
     if dense_match == "latent":
         return match, latent_functions(source, target, bases)
-    C = fmap_from_match(Phi, Psi, target.low.mass, match)  # of eq. 3, for eq. 4
+    C = fmap_from_match(Phi, Psi, target.low.mass, match)  # eq. 3, for eq. 4
     return match, (source.functions(C.T), target.functions(np.eye(k)))
 
 
 def latent_functions(source: Shape, target: Shape, bases: Functions) -> Functions:
-    """The latent functions Phi Y of both, whose rows eq. 7 compares."""
+    """Return the latent functions Phi Y of both shapes, whose rows eq. 7 compares."""
     Y_source, Y_target = bases
     return source.functions(Y_source), target.functions(Y_target)
 
@@ -181,7 +180,7 @@ def match_functions(
 ) -> tuple[Array, float, float]:
     """Match at full resolution by nearest rows of U F: eq. 7 with F = Phi Y, eq. 4 with Phi C^T.
 
-    Functions that have a row for every original vertex are taken as they are.
+    Functions with a row for every original vertex are used directly.
 
     Returns
     -------
@@ -197,17 +196,17 @@ def match_functions(
 def refine_at_full_resolution(
     source: Shape, target: Shape, C: Array, B: Array | None = None
 ) -> Array:
-    """One more round of ZoomOut: coarse target vertices look among all vertices of the source.
+    """Refine a map by a ZoomOut iteration that searches all vertices of the source.
 
-    ZoomOut on the coarse meshes can only match coarse vertices, half their spacing off; that noise
-    is in its C.
+    ZoomOut on the coarse meshes matches coarse vertices only.  Its C has noise of half the vertex
+    spacing, which this iteration removes.
 
     Parameters
     ----------
     source, target : Shape
     C : float ndarray (k_target, k_source)
     B : float ndarray (n_source, >= k_source), optional
-        Functions of the source at all its vertices; U Phi by default.
+        Functions of the source at all vertices; U Phi by default.
 
     Returns
     -------
@@ -232,40 +231,40 @@ def from_latent(
     dense_match: str = "latent",
     **options: Any,
 ) -> xr.Dataset:
-    """One shape registered by the latent bases of a network (eq. 6, 7 and 8).
+    """Register one shape by the latent bases of a network (eq. 6, 7 and 8).
 
-    Eq. 6 gives one start and ICP another; elastic iterations refine both, and the best is kept.
-    Eq. 7, or eq. 3 and 4, is the match at full resolution with ``refine="intrinsic"``, as in the
-    paper, or where that candidate is the best; eq. 8 follows.
+    Eq. 6 and ICP give two initialisations.  Elastic iterations refine both, and the result with the
+    lower score is returned.  With ``refine="intrinsic"``, as in the paper, or if that candidate is
+    the best, the match at full resolution is that of eq. 7, or of eq. 3 and 4.  Eq. 8 follows.
 
     Parameters
     ----------
     source, target : Shape
         The shape and the template.
     bases : tuple of float ndarray (k, m)
-        Their consistent latent bases Y.
+        Consistent latent bases Y of both.
     transform : tuple (R, t)
         Rigid transform of the shape onto the template (4.1, step 2), between their frames.
     dense_match : {"latent", "fmap"}
         Eq. 7, or eq. 3 and 4.
     **options
-        Of :func:`register`.
+        Options of :func:`register`.
 
     Returns
     -------
     xarray.Dataset
-        As of :func:`register`.
+        Registration, see :func:`register`.
     """
     match, functions = match_low(source, target, bases, dense_match=dense_match)
-    near = nearest_after_alignment(source.low, target.low, transform)
-    starts = {"intrinsic": match, "icp": near}
-    return register(source, target, starts, functions, transform, k=len(bases[0]), **options)
+    by_icp = nearest_after_alignment(source.low, target.low, transform)
+    matches = {"intrinsic": match, "icp": by_icp}
+    return register(source, target, matches, functions, transform, k=len(bases[0]), **options)
 
 
 def register(
     source: Shape,
     target: Shape,
-    starts: dict[str, Array],
+    matches: dict[str, Array],
     functions: Functions,
     transform: RigidTransform,
     *,
@@ -275,60 +274,62 @@ def register(
     articulated: bool = True,
     alignment: str = "fitted",
 ) -> xr.Dataset:
-    """The registration of one shape: match, displacement, transform, confidence and the way back.
+    """Register one shape to the template at full resolution.
 
     Parameters
     ----------
     source, target : Shape
         The shape and the template.
-    starts : dict
-        Name -> match (n_coarse_target,): starts at low resolution; "intrinsic" is among them.
+    matches : dict
+        Name -> match (n_coarse_target,): initialisations at low resolution, one of them
+        "intrinsic".
     functions : tuple (F_source, F_target)
         Functions on both coarse meshes for the match at full resolution, see
         :func:`match_functions`.
     transform : tuple (R, t)
         Rigid transform of the shape onto the template found by ICP, between their frames.
     k : int
-        Functions in which the displacement lives.
+        Number of eigenfunctions of the displacement.
     refine : {"elastic", "spectral_icp", "intrinsic"}
-        Elastic and local iterations, after joint ones in far poses; joint iterations; or the
-        spectral match alone.  After local iterations the displacement is not only in the first k
-        functions; ``displacement_coefficient`` is its part there.
+        Elastic and local iterations, after spectral ICP if poses differ; spectral ICP; or the
+        spectral match alone.  After local iterations the displacement exceeds the first k
+        functions; ``displacement_coefficient`` is its projection onto them.
     remove_size : bool
-        Whether size is taken out of the displacement.
+        Whether to remove size from the displacement.
     articulated : bool
-        Whether in far poses joint iterations may turn the parts of a shape on their own.
+        Whether spectral ICP may be piecewise rigid if poses differ.
     alignment : {"fitted", "icp"}
-        The displacement is measured after the transform that fits the registered surface best, or
-        after that of ICP, as the paper has it: then eq. 8 and (U Phi)(U Phi)^+ are as printed.
+        Measure the displacement after the rigid transform that fits the registered surface best, or
+        after that of ICP as in the paper; then eq. 8 and (U Phi)(U Phi)^+ hold as printed.
 
     Returns
     -------
     xarray.Dataset
-        ``registered_match(vertex)``, ``displacement(vertex, xyz)``, ``displacement_raw``,
-        ``registered_match_low(low_vertex)``, the start "intrinsic" (of eq. 6, or of ZoomOut where a
-        pair is matched on its own), and ``displacement_low(low_vertex, xyz)`` of it;
-        ``displacement_coefficient(eigenpair, xyz)`` of the displacement in U Phi of the template;
-        ``icp_rotation``, ``icp_translation`` as given; ``rotation``, ``translation``, ``scale``,
-        ``confidence(vertex)``, ``round_trip``, ``distortion``,
-        ``template_triangle(original_vertex)``, ``template_barycentric``; displacements in the unit
-        of the input, in the template's frame.  Attributes ``method``, the candidate that was kept,
-        ``score``, its score at full resolution, and ``score_<candidate>`` at low resolution.
+        ``registered_match(vertex)``, ``displacement(vertex, xyz)``, ``displacement_raw``;
+        ``registered_match_low(low_vertex)``, the match "intrinsic" (eq. 6, or ZoomOut if a pair is
+        matched without a network), and its ``displacement_low(low_vertex, xyz)``;
+        ``displacement_coefficient(eigenpair, xyz)`` in U Phi of the template; ``icp_rotation``,
+        ``icp_translation`` as given; ``rotation``, ``translation``, ``scale``,
+        ``confidence(vertex)``, ``round_trip``, ``distortion``;
+        ``template_triangle(original_vertex)``, ``template_barycentric``.  Displacements are in the
+        unit of the input, in the frame of the template.  Attributes: ``initialisation``, the
+        candidate with the best ``score`` at full resolution, and ``score_<candidate>`` at low
+        resolution.
     """
     check("alignment", alignment)
     candidates = find_candidates(
-        source, target, starts, k=k, refine=refine, articulated=articulated
+        source, target, matches, k=k, refine=refine, articulated=articulated
     )
     by_icp = (
         _transform_in_unit(source, target, transform, remove_size) if alignment == "icp" else None
     )
-    # image = R x + t + U Phi c, smooth already: the line after eq. 8; or of elastic iterations
-    placed, elastic = by_icp and (transform, by_icp[3]), refine == "elastic"
+    # image = R x + t + U Phi c, smoothed by the line after eq. 8 or by elastic iterations
+    fixed, elastic = by_icp and (transform, by_icp[3]), refine == "elastic"
     match, moved, attrs = register_surface(
-        source, target, candidates, functions, placed, elastic=elastic
+        source, target, candidates, functions, fixed, elastic=elastic
     )
     image = source.from_frame(moved.X)
-    triangle, barycentric = way_back(source.full, moved)
+    triangle, barycentric = closest_on_template(source.full, moved)
     X, T = as_arrays(target.original)
     if by_icp:
         R, t, s, _ = by_icp
@@ -339,16 +340,16 @@ def register(
         )
     raw = s * source.original["position"].values[match] @ R.T + t - X
     X_low = target.coarse["position"].values
-    low = s * source.coarse["position"].values[starts["intrinsic"]] @ R.T + t - X_low
+    low = s * source.coarse["position"].values[matches["intrinsic"]] @ R.T + t - X_low
     coefficient = target.full.coefficients(displacement[target.near_coarse])  # (k, 3)
     trip = round_trip(target, match, triangle, barycentric)
-    sure = confidence(source, target, match, moved.X)
+    probability = confidence(source, target, match, moved.X)
     registration = dataset(
         attrs,
         registered_match=match.astype(np.int32),
         displacement=displacement.astype(np.float32),
         displacement_raw=raw.astype(np.float32),
-        registered_match_low=starts["intrinsic"].astype(np.int32),
+        registered_match_low=matches["intrinsic"].astype(np.int32),
         displacement_low=low.astype(np.float32),
         displacement_coefficient=coefficient,
         rotation=R,
@@ -356,26 +357,23 @@ def register(
         scale=np.array(s),
         icp_rotation=transform[0],
         icp_translation=transform[1],
-        confidence=sure.astype(np.float32),
+        confidence=probability.astype(np.float32),
         round_trip=trip.astype(np.float32),
         distortion=log_area_ratio(image, X, T).astype(np.float32),
         template_triangle=triangle.astype(np.int32),
         template_barycentric=barycentric,
     )
     if not np.isfinite(registration["displacement"]).all():
-        raise ValueError("the displacement is not finite: look at the shape's coordinates")
+        raise ValueError("the displacement is not finite: check the coordinates of the shape")
     return in_unit(registration, common_unit(source.original, target.original))
 
 
 def _transform_in_unit(
     source: Shape, target: Shape, transform: RigidTransform, remove_size: bool
 ) -> tuple[Array, Array, float, float]:
-    """A rigid transform between the frames of two shapes as one between their files: R, t and s.
+    """Convert a rigid transform between frames to the unit of the files: R, t, s, ratio of sizes.
 
-    And the ratio of sizes that it leaves.
-
-    Without `remove_size` each keeps its size: the transform turns the source about its centre and
-    carries that to where it belongs.
+    Without `remove_size` both shapes keep their size: s is 1.
     """
     (center, size), (center_target, size_target) = source.frame, target.frame
     R, t = transform
@@ -386,36 +384,35 @@ def _transform_in_unit(
 def find_candidates(
     source: Shape,
     target: Shape,
-    starts: dict[str, Array],
+    matches: dict[str, Array],
     *,
     k: int = 100,
     refine: str = "elastic",
     articulated: bool = True,
 ) -> dict[str, spectral_icp.Candidate]:
-    """Where registration at full resolution may begin: of low resolution, with scores.
+    """Return the low-resolution candidates to initialise full resolution, with their scores.
 
-    Elastic iterations need no better start than a match of the right parts: from eq. 6, from ICP
-    and from joint iterations after either they mostly end at one place (docs/decisions.md), so that
-    joint iterations are left to far poses.
+    Elastic iterations converge to the same registration from eq. 6, from ICP and from spectral ICP
+    after either (docs/decisions.md).  Spectral ICP is used only if poses differ.
 
     Parameters
     ----------
-    source, target, starts, k, refine, articulated : see :func:`register`
+    source, target, matches, k, refine, articulated : see :func:`register`
 
     Returns
     -------
     dict
-        Name -> :class:`s4a.method.spectral_icp.Candidate`; none for the spectral match alone.
+        Name -> :class:`s4a.method.spectral_icp.Candidate`; empty for the spectral match alone.
     """
     check("refine", refine)
     if refine == "intrinsic":
         return {}
     M, N = source.low, target.low
     if refine == "spectral_icp" or all(
-        spectral_icp.far_apart(M, N, match) for match in starts.values()
+        spectral_icp.poses_differ(M, N, match) for match in matches.values()
     ):
-        return spectral_icp.candidates(M, N, starts, k=k, articulated=articulated)
-    return spectral_icp.as_given(M, N, starts)
+        return spectral_icp.candidates(M, N, matches, k=k, articulated=articulated)
+    return spectral_icp.unrefined_candidates(M, N, matches)
 
 
 def register_surface(
@@ -423,26 +420,25 @@ def register_surface(
     target: Shape,
     candidates: dict[str, spectral_icp.Candidate],
     functions: Functions,
-    placed: tuple[RigidTransform, float] | None = None,
+    fixed: tuple[RigidTransform, float] | None = None,
     *,
     elastic: bool = False,
 ) -> tuple[Array, Basis, dict[str, Any]]:
-    """The template registered at full resolution: the best of the finalists of low resolution.
+    """Register the template at full resolution: the best of the low-resolution finalists.
 
     Parameters
     ----------
     source, target : Shape
     candidates : dict
-        Of :func:`find_candidates`; empty for the spectral match alone.
+        Candidates of :func:`find_candidates`; empty for the spectral match alone.
     functions : see :func:`register`
-    placed : tuple (transform, ratio), optional
-        After which the displacement of the spectral match is smoothed, see
-        :func:`s4a.method.spectral_icp.warp_after`; by default after the transform that fits it
-        best.
+    fixed : tuple (transform, ratio), optional
+        Transform after which the displacement of the spectral match is smoothed, see
+        :func:`s4a.method.spectral_icp.warp_after`; by default the transform of best fit.
     elastic : bool
-        Whether finalists go through :func:`elastic_surfaces`, and through looser iterations, too,
-        where the best end is torn (:func:`tear`); those by parts, of far poses, through local
-        iterations alone, as bodies otherwise ended farther from the truth.
+        Whether to refine finalists by :func:`elastic_surfaces`, again with less stiffness if the
+        strain of the best result is too large (:func:`strain_quantile`).  Piecewise rigid
+        finalists get local iterations only, which were more accurate on bodies.
 
     Returns
     -------
@@ -456,101 +452,99 @@ def register_surface(
     attrs: dict[str, float | str] = {
         f"score_{name}": candidate.score for name, candidate in candidates.items()
     }
-    ends: dict[str, tuple[float, Basis]] = {}
-    # starts as they are tell less of their ends than joint iterations do
+    results: dict[str, tuple[float, Basis]] = {}
+    # unrefined candidates predict the final score less well
     margin = 2.0 if elastic else 1.25
     names = spectral_icp.finalists(candidates, margin=margin) if candidates else ["intrinsic"]
     if elastic:
-        whole = {n: candidates[n].warp for n in names if candidates[n].warp[0].ndim == 2}
-        names = [name for name in names if name not in whole]  # by parts
-        surfaces = elastic_surfaces(source, target, whole)
-        ends = {f"{name}+elastic": _scored_alone(M, N, X) for name, X in surfaces.items()}
-        limit = TORN * (1 - _SMEARED if len(target.low.X) < FEW else 1)
-        if ends and tear(ends[_best_of(ends)][1], N) > limit:
-            torn = ends[_best_of(ends)]
-            again = elastic_surfaces(source, target, whole, looser=True)
-            scored = {f"{name}+looser": _scored_alone(M, N, X) for name, X in again.items()}
-            ends |= {name: end for name, end in scored.items() if mends(end, torn, N)}
+        warps = {n: candidates[n].warp for n in names if candidates[n].warp[0].ndim == 2}
+        names = [name for name in names if name not in warps]  # piecewise rigid
+        surfaces = elastic_surfaces(source, target, warps)
+        results = {f"{name}+elastic": _score_nearest(M, N, X) for name, X in surfaces.items()}
+        limit = MAX_STRAIN * (1 - _STRAIN_REDUCTION if len(target.low.X) < FEW else 1)
+        if results and strain_quantile(results[_lowest_score(results)][1], N) > limit:
+            strained = results[_lowest_score(results)]
+            surfaces = elastic_surfaces(source, target, warps, less_stiff=True)
+            scored = {f"{name}+looser": _score_nearest(M, N, X) for name, X in surfaces.items()}
+            results |= {name: r for name, r in scored.items() if improves(r, strained, N)}
     for name in names:
         if name == "intrinsic":
             match, compared, certified = match_functions(source, target, *functions)
             attrs |= {"compared_share": compared, "certified_share": certified}
-            part = match[N.near_coarse]
+            match_near = match[N.near_coarse]
             warp = (
-                spectral_icp.warp_after(M, N, part, *placed)
-                if placed
-                else spectral_icp.fit_warp(M, N, part)
+                spectral_icp.warp_after(M, N, match_near, *fixed)
+                if fixed
+                else spectral_icp.fit_warp(M, N, match_near)
             )
         else:
-            part, warp = spectral_icp.dense_spectral_icp(M, N, candidates[name].warp)
-        if elastic:  # here by parts
+            match_near, warp = spectral_icp.dense_spectral_icp(M, N, candidates[name].warp)
+        if elastic:  # the piecewise rigid candidates
             X = _after_local_iterations(source, target, warp)
-            ends[f"{name}+local"] = _scored_alone(M, N, X)
+            results[f"{name}+local"] = _score_nearest(M, N, X)
         else:
             moved = N.moved_to(spectral_icp.move(N, warp))
-            ends[name] = spectral_icp.registration_score(M, N, part, moved), moved
-    method = _best_of(ends)
-    score, moved = ends[method]
-    if method != "intrinsic":
+            results[name] = spectral_icp.registration_score(M, N, match_near, moved), moved
+    best = _lowest_score(results)
+    score, moved = results[best]
+    if best != "intrinsic":
         match = match_surfaces(moved.X, moved.normals, M.X, M.normals)
-    attrs |= {"initialisation": method, "score": score}
+    attrs |= {"initialisation": best, "score": score}
     return match, moved, attrs
 
 
-def _best_of(ends):
-    """The name of the end of registration that has the lowest score."""
-    return min(ends, key=lambda name: ends[name][0])
+def _lowest_score(results):
+    """Name of the result with the lowest score."""
+    return min(results, key=lambda name: results[name][0])
 
 
-def tear(moved: Basis, target: Basis) -> float:
-    """How much the registered template is stretched or squeezed, where it is most.
+def strain_quantile(moved: Basis, target: Basis) -> float:
+    """Return the 99 % quantile of the |log| area ratio of the registered template.
 
-    The |log| of the ratio of areas that a hundredth of its vertices exceeds.  Between a place on
-    the right fold and one on the fold beside, the template is torn.
+    The strain is large where neighbouring vertices are registered to different folds.
     """
     strain = np.abs(log_area_ratio(moved.X, target.X, target.T))
     return float(np.quantile(strain, 0.99))
 
 
-def mends(end: tuple[float, Basis], torn: tuple[float, Basis], target: Basis) -> bool:
-    """Whether an end is better than a torn one, in score and tear together (``_MENDED``).
+def improves(result: tuple[float, Basis], strained: tuple[float, Basis], target: Basis) -> bool:
+    """Return whether a result is better than a strained one, by score times strain.
 
-    Score alone falls where a looser template follows noise, which tears it more.  The lower score
-    decides among the ends that are left (``_best_of``).
+    The score alone also falls if a less stiff template follows noise, but its strain grows then.
     """
-    before, after = (score * tear(moved, target) for score, moved in (torn, end))
-    return after < _MENDED * before
+    before, after = (score * strain_quantile(moved, target) for score, moved in (strained, result))
+    return after < _MAX_REMAINING * before
 
 
-def _scored_alone(source, target, X):
-    """Score of the registered target, matched by what is nearest to it, and that target."""
+def _score_nearest(source, target, X):
+    """Score of the registered target, matched by nearest vertices, and the registered target."""
     moved = target.moved_to(X)
     match = spectral_icp.nearest_vertices(source, moved)
     return spectral_icp.registration_score(source, target, match, moved), moved
 
 
 def elastic_surfaces(
-    source: Shape, target: Shape, starts: dict[str, spectral_icp.Warp], *, looser: bool = False
+    source: Shape, target: Shape, warps: dict[str, spectral_icp.Warp], *, less_stiff: bool = False
 ) -> dict[str, Array]:
-    """The template ``(n_target, 3)`` after elastic iterations from several starts, and local ones.
+    """Return the template ``(n_target, 3)`` after elastic and local iterations, by initialisation.
 
-    Starts that meet go on as one, see :func:`s4a.method.elastic.converging_initialisations`.  Where
-    the end of that lies on a fold beside the one on which a start was right, iterations from the
-    starts themselves that begin less stiff, `looser`, may end on the right one.
+    Initialisations that converge are merged, see
+    :func:`s4a.method.elastic.converging_initialisations`.  If their mean ends on a wrong fold, less
+    stiff iterations from the separate initialisations, `less_stiff`, may find the right one.
     """
     M, N, landmarks = source.full, target.low_on_surface, _common_landmarks(source, target)
-    if not looser:
-        starts = converging_initialisations(M, N, starts, landmarks)
-    schedule = FOLLOWING._replace(stiffness=STIFFNESS[_LOOSER if looser else 0 :])
+    if not less_stiff:
+        warps = converging_initialisations(M, N, warps, landmarks)
+    schedule = DEFORMATION._replace(stiffness=STIFFNESS[_LESS_STIFF_STEP if less_stiff else 0 :])
     surfaces = {}
-    for name, start in starts.items():
-        warp = elastic_iterations(M, N, start, schedule, landmarks=landmarks)
+    for name, initial in warps.items():
+        warp = elastic_iterations(M, N, initial, schedule, landmarks=landmarks)
         surfaces[name] = _after_local_iterations(source, target, warp)
     return surfaces
 
 
 def _common_landmarks(source, target):
-    """The landmarks that both shapes have by name; None where there are none."""
+    """Landmarks of the same name on both shapes, or None."""
     names, at_source = source.landmarks
     names_target, at_target = target.landmarks
     common = [name for name in names_target if name in names]
@@ -559,28 +553,28 @@ def _common_landmarks(source, target):
     B = at_target[[names_target.index(name) for name in common]]  # (l, n_target)
     y = at_source[[names.index(name) for name in common]] @ source.full.X
     N = target.full
-    none = np.zeros((0, 3), int)
-    return Landmarks(Basis(B @ N.X, none, B @ N.area, target.low.Phi, U=B @ target.U), y)
+    no_triangles = np.zeros((0, 3), int)
+    return Landmarks(Basis(B @ N.X, no_triangles, B @ N.area, target.low.Phi, U=B @ target.U), y)
 
 
 def _after_local_iterations(source: Shape, target: Shape, warp: spectral_icp.Warp) -> Array:
-    """The template ``(n_target, 3)`` after a warp, by parts or not, and local iterations."""
+    """Return the template ``(n_target, 3)`` after a warp and local iterations."""
     low, landmarks = target.low_on_surface, _common_landmarks(source, target)
-    pull = landmarks and (
+    residuals = landmarks and (
         landmarks[0].U,
         landmarks.y - spectral_icp.move(landmarks.on_target, warp),
     )
     d = local_iterations(
-        source.full, low, target.diffusion, spectral_icp.move(low, warp), pull=pull
+        source.full, low, target.diffusion, spectral_icp.move(low, warp), landmarks=residuals
     )
     return spectral_icp.move(target.full, warp) + target.U @ d
 
 
-def way_back(source: Basis, moved: Basis) -> tuple[Array, Array]:
-    """For every vertex of the source the closest point of the registered template.
+def closest_on_template(source: Basis, moved: Basis) -> tuple[Array, Array]:
+    """Return the closest point of the registered template to every vertex of the source.
 
-    The nearest template vertex in position and normal is looked up first, then the closest point on
-    the triangles around it, so that the normals agree.
+    It lies on a triangle around the template vertex that is nearest in position and normal, so that
+    the normals agree.
 
     Parameters
     ----------
@@ -599,7 +593,7 @@ def way_back(source: Basis, moved: Basis) -> tuple[Array, Array]:
 
 
 def round_trip(target: Shape, match: Array, triangle: Array, barycentric: Array) -> Array:
-    """Length of the way template -> shape -> template ``(n_target,)``, as a share of sqrt(area)."""
+    """Distance after template -> shape -> template ``(n_target,)``, as a share of sqrt(area)."""
     X = target.full.X
     corner = X[target.full.T[triangle[match]]]  # (n_target, 3 corners, 3)
     back = np.einsum("nc,ncx->nx", barycentric[match], corner)
@@ -607,9 +601,9 @@ def round_trip(target: Shape, match: Array, triangle: Array, barycentric: Array)
 
 
 def log_area_ratio(image: Array, X: Array, T: Array) -> Array:
-    """log(a / A) for every vertex ``(n,)``: its share of the area after and before registration.
+    """log(a / A) at every vertex ``(n,)``, with its area share after and before registration.
 
-    0 where nothing is stretched but the size as a whole.
+    0 if the surface is only scaled as a whole.
 
     Examples
     --------
@@ -627,13 +621,13 @@ def log_area_ratio(image: Array, X: Array, T: Array) -> Array:
 
 
 def common_unit(*meshes: xr.Dataset) -> str:
-    """The unit that all meshes say; "unit of the input" where they do not."""
+    """Return the unit of all meshes, or "unit of the input" if they differ or have none."""
     units = {mesh.attrs.get("unit") or INPUT for mesh in meshes}
     return units.pop() if len(units) == 1 else INPUT
 
 
 def identity(template: Shape) -> xr.Dataset:
-    """The template's own file of ``/registration``: every vertex matches itself, nothing moves."""
+    """Return the registration of the template to itself: the identity, without displacement."""
     X, T = as_arrays(template.original)
     # a corner of every vertex: the last in the order of the vertices
     last = np.cumsum(np.bincount(T.ravel(), minlength=len(X))) - 1

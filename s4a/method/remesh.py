@@ -1,12 +1,12 @@
 r"""Low-resolution mesh and its projection operator U (4.1, step 1; U appears in eq. 4 and 7).
 
-In the spirit of ReMatching (Maggioli et al. 2024): well-spread samples, the manifold dual of their
-geodesic Voronoi cells (:mod:`s4a.geometry.voronoi`), and for every vertex of the original the
-closest point on the coarse triangles around its own cell.  A row of U holds the barycentric weights
-of that point::
+Follows ReMatching (Maggioli et al. 2024): farthest-point samples, the manifold dual of their
+geodesic Voronoi cells (:mod:`s4a.geometry.voronoi`), and for every original vertex the closest
+point on the coarse triangles around the sample of its cell.  A row of U holds the barycentric
+weights of that point::
 
-                 c            p: the point closest to x of all coarse triangles around a,
-                / \              the sample whose cell holds x
+                 c            p: the point closest to x on the coarse triangles around a,
+                / \              the sample whose cell contains x
                /   \
       x . . . p     \         row of x in U: the weights u at a, v at b, w at c of p,
              /       \        so that (U f)(x) = u f(a) + v f(b) + w f(c)
@@ -35,18 +35,18 @@ from s4a.schema import Array, check_count, dataset
 from s4a.seeds import RNG, seed_of
 
 GL = "install the system's libgl1 and libopengl0, or see `s4a doctor`"
-FIRST = 0.95  # share of n_coarse that is sampled first; mending faults needs the rest
-MOST = 1.1  # share of n_coarse from which on handles are cut, rather than more samples added
-_CUTS = 3  # how often that is tried before samples are added without limit
+INITIAL_SHARE = 0.95  # of n_coarse that is sampled first; the rest repairs the topology of cells
+MAX_SHARE = 1.1  # of n_coarse, above which handles are cut instead of adding samples
+_N_CUTS = 3  # attempts to cut handles before samples are added without limit
 
 
 def sample_surface(
     X: Array, T: Array, G: sp.csr_matrix, boundary: Array, avoid: Array, k: int, seed: int = 0
 ) -> Array:
-    """About k vertices spread over the surface, its boundary edges `boundary` at the same spacing.
+    """Sample about k vertices of a surface evenly, with the same spacing along its boundary.
 
-    Farthest points of (position, spacing * normal): the two sides of a thin wall count as apart,
-    and bends get more.
+    Farthest points in (position, spacing * normal), so that both sides of a thin wall are sampled,
+    and curved regions more densely.
 
     Parameters
     ----------
@@ -54,8 +54,9 @@ def sample_surface(
     G : sparse matrix (n, n)
         :func:`s4a.geometry.mesh.edge_graph`.
     boundary : int ndarray (r, 2)
+        Boundary edges.
     avoid : bool ndarray (n,)
-        Vertices that are not taken.
+        Vertices that are not sampled.
     k, seed : int
 
     Returns
@@ -63,10 +64,10 @@ def sample_surface(
     int ndarray, sorted
     """
     area = vertex_areas(X, T)
-    spacing = np.sqrt(2 / np.sqrt(3) * area.sum() / k)  # of equilateral triangles around k vertices
+    spacing = np.sqrt(2 / np.sqrt(3) * area.sum() / k)  # edge of equilateral triangles
     N = vertex_normals(X, T)
     ring = G.astype(bool).astype(float)
-    for _ in range(2):  # noise is smoothed away, bends of the size of the spacing stay
+    for _ in range(2):  # removes noise, keeps curvature at the scale of the spacing
         N = N + ring @ N
         N /= np.maximum(np.linalg.norm(N, axis=1, keepdims=True), 1e-300)
     X = X - area @ X / area.sum()
@@ -85,16 +86,16 @@ def sample_surface(
 
 
 def laplacian(X: Array, T: Array, area: Array) -> tuple[Array, Array, Array, str]:
-    """Edges, cotan weights, vertex areas, and which Laplacian it is.
+    """Return edges, cotan weights, vertex areas and kind of the Laplacian.
 
     Returns
     -------
     E : int ndarray (e, 2)
     w : float ndarray (e,)
     area : float ndarray (n,)
-        As given, raised to a thousandth of their mean so that none vanishes.
+        As given, but at least a thousandth of their mean.
     kind : {"cotan", "robust"}
-        "robust" (Sharp & Crane 2020) where triangles are degenerate or edges not manifold.
+        "robust" (Sharp & Crane 2020) if triangles are degenerate or edges non-manifold.
     """
     area = np.maximum(area, 1e-3 * area.mean())
     E, edge_of, count = surface.unique_edges(T, len(X))
@@ -108,16 +109,16 @@ def laplacian(X: Array, T: Array, area: Array) -> tuple[Array, Array, Array, str
 
 
 def _sorted_mesh(X, T):
-    """The mesh in an order of vertices and triangles that positions alone decide, and that order.
+    """The mesh sorted by position, and the order of its vertices.
 
-    The same surface gives the same coarse mesh, however its file numbers it.
+    The coarse mesh then does not depend on the numbering of the file.
     """
     order = surface.lexical_order(X[:, ::-1])
     rank = np.empty(len(X), np.int64)
     rank[order] = np.arange(len(X))
     T = rank[T]
-    turn = (T.argmin(1)[:, None] + np.arange(3)) % 3  # the least corner first, the turn kept
-    T = np.take_along_axis(T, turn, axis=1)
+    cyclic = (T.argmin(1)[:, None] + np.arange(3)) % 3  # least corner first, same orientation
+    T = np.take_along_axis(T, cyclic, axis=1)
     first_two = T[:, 0] * len(X) + T[:, 1]
     return X[order], T[surface.lexical_order(np.stack([T[:, 2], first_two], axis=1))], order
 
@@ -129,35 +130,35 @@ def _coarse_surface(X, T, n_coarse, seed=0):
     -------
     Y, C : the coarse mesh
     sample : int ndarray
-        Vertex of the mesh that each coarse vertex is; -1 for the centre of a closed opening.
+        Mesh vertex of each coarse vertex; -1 for the centre of a closed opening.
     cell : int ndarray (n,)
-        Coarse vertex near each vertex of the mesh.
+        Coarse vertex whose cell contains each vertex of the mesh.
     attrs : dict
-        Counts of samples, iterations and vertices cut.
+        Numbers of samples, iterations and vertices cut.
     """
-    V, F = X, T  # the surface as far as handles have been cut
-    origin = np.arange(len(X))  # vertex of X that each of V is, -1 for the centre of a fan
-    for most in [MOST * n_coarse] * _CUTS + [np.inf]:
+    V, F = X, T  # the surface after cutting handles
+    origin = np.arange(len(X))  # row of X of each vertex of V, -1 for the centre of a fan
+    for max_samples in [MAX_SHARE * n_coarse] * _N_CUTS + [np.inf]:
         graph = voronoi.mesh_graph(V, F)
-        centre = origin < 0
-        n_first = max(4, round(FIRST * n_coarse))
-        first = sample_surface(V, F, graph.G, graph.E[graph.is_open], centre, n_first, seed)
-        start = voronoi.voronoi_cells(graph.G, first)
-        state, iterations, faulty = voronoi.refine(graph, start, most, centre)
+        is_centre = origin < 0
+        n_initial = max(4, round(INITIAL_SHARE * n_coarse))
+        initial = sample_surface(V, F, graph.G, graph.E[graph.is_open], is_centre, n_initial, seed)
+        cells = voronoi.voronoi_cells(graph.G, initial)
+        state, iterations, faulty = voronoi.refine(graph, cells, max_samples, is_centre)
         if not faulty:
             break
-        region = voronoi.thin_regions(graph, start)
-        crumb = triangle_areas(V, F).sum() / n_coarse  # the area of a cell
-        V, F, came_from = voronoi.cut_handles(
-            V, F, voronoi.between_boundaries(graph.G, F, region), crumb
+        region = voronoi.thin_regions(graph, cells)
+        cell_area = triangle_areas(V, F).sum() / n_coarse
+        V, F, rows = voronoi.cut_handles(
+            V, F, voronoi.between_boundaries(graph.G, F, region), cell_area
         )
-        origin = np.where(came_from >= 0, origin[came_from], -1)
+        origin = np.where(rows >= 0, origin[rows], -1)
     cell = np.full(len(X), -1)
-    kept = np.flatnonzero(origin >= 0)
-    cell[origin[kept]] = state.cell[kept]
+    is_original = np.flatnonzero(origin >= 0)
+    cell[origin[is_original]] = state.cell[is_original]
     attrs = {
-        "samples_first": len(first),
-        "samples_added": len(state.sample) - len(first),
+        "samples_first": len(initial),
+        "samples_added": len(state.sample) - len(initial),
         "iterations": iterations,
         "vertices_cut": int((cell < 0).sum()),
     }
@@ -166,31 +167,31 @@ def _coarse_surface(X, T, n_coarse, seed=0):
     return V[state.sample], voronoi.dual(F, state.cell), origin[state.sample], cell, attrs
 
 
-def _nearest_along_edges(X, T, among):
-    """The vertex of `among` that is nearest to each vertex along edges ``(n,)``."""
+def _nearest_along_edges(X, T, vertices):
+    """Nearest one of some vertices along edges, for each vertex ``(n,)``."""
     G = surface.edge_graph(X, surface.edges(T))
-    return dijkstra(G, indices=among, min_only=True, return_predecessors=True)[2]
+    return dijkstra(G, indices=vertices, min_only=True, return_predecessors=True)[2]
 
 
 def check_wrap() -> None:
-    """Raise ValueError where PyMeshLab, which wraps a surface around another, cannot be used."""
+    """Raise ValueError if PyMeshLab, which computes alpha wraps, cannot be used."""
     if find_spec("pymeshlab") is None:
         raise ValueError("wrap=True needs PyMeshLab: install it with `pip install 's4a[wrap]'`")
     try:
         with silence():
             import pymeshlab
 
-            whole = hasattr(pymeshlab.MeshSet(verbose=False), "generate_alpha_wrap")
+            has_filter = hasattr(pymeshlab.MeshSet(verbose=False), "generate_alpha_wrap")
     except ImportError as error:
         raise ValueError(
-            f"wrap=True needs PyMeshLab, which does not import: {error}; {GL}"
+            f"wrap=True needs PyMeshLab, which cannot be imported: {error}; {GL}"
         ) from error
-    if not whole:
+    if not has_filter:
         raise ValueError(f"wrap=True needs a filter that PyMeshLab lacks: {GL}")
 
 
 def alpha_wrap(X: Array, T: Array, alpha: float = 1.0, offset: float = 0.2) -> tuple[Array, Array]:
-    """A closed surface wrapped around the mesh; `alpha` and `offset` in percent of its diagonal."""
+    """Wrap a closed surface around a mesh; `alpha` and `offset` in percent of its diagonal."""
     check_wrap()
     with silence():
         import pymeshlab
@@ -205,28 +206,28 @@ def alpha_wrap(X: Array, T: Array, alpha: float = 1.0, offset: float = 0.2) -> t
 
 @contextlib.contextmanager
 def silence() -> Iterator[None]:
-    """Nothing that native code writes reaches the terminal."""
+    """Suppress the terminal output of native code."""
     with open(os.devnull, "w") as null:
-        kept = [(fd, os.dup(fd)) for fd in (1, 2)]
+        copies = [(fd, os.dup(fd)) for fd in (1, 2)]
         try:
-            for fd, _ in kept:
+            for fd, _ in copies:
                 os.dup2(null.fileno(), fd)
             yield
         finally:
-            for fd, copy in kept:
+            for fd, copy in copies:
                 os.dup2(copy, fd)
                 os.close(copy)
 
 
 def _nearest_with_normal(X, T, V, F):
-    """Vertex of (V, F) near each vertex of (X, T), on a side of a wall that faces the same way."""
-    reach = 0.02 * np.linalg.norm(np.ptp(V, axis=0))
-    tree = cKDTree(np.c_[V, reach * vertex_normals(V, F)])
-    return tree.query(np.c_[X, reach * vertex_normals(X, T)])[1]
+    """Vertex of (V, F) nearest to each vertex of (X, T) in position and normal."""
+    weight = 0.02 * np.linalg.norm(np.ptp(V, axis=0))
+    tree = cKDTree(np.c_[V, weight * vertex_normals(V, F)])
+    return tree.query(np.c_[X, weight * vertex_normals(X, T)])[1]
 
 
 def topology(T: Array) -> dict[str, int]:
-    """Euler characteristic, number of boundary loops, and of edges with three or more triangles."""
+    """Count Euler characteristic, boundary loops and edges with three or more triangles."""
     E, _, count = surface.unique_edges(T)
     boundary, vertex = np.unique(E[count == 1], return_inverse=True)
     loop = surface.components(vertex.reshape(-1, 2), len(boundary))
@@ -238,7 +239,7 @@ def topology(T: Array) -> dict[str, int]:
 
 
 def check_clean(X: Array, T: Array) -> dict[str, int]:
-    """Topology of a mesh that :func:`coarsen` can take.
+    """Return the topology of a mesh after checking that :func:`coarsen` can process it.
 
     Raises
     ------
@@ -247,16 +248,16 @@ def check_clean(X: Array, T: Array) -> dict[str, int]:
     """
     if len(T) == 0 or T.min() < 0 or T.max() >= len(X) or not np.isfinite(X).all():
         raise ValueError(
-            "coarsen needs triangles of existing vertices at finite positions; found others: "
+            "coarsen needs triangles with valid indices and finite positions; found others: "
             "clean the mesh first"
         )
     counts = topology(T)
-    idle, knots = len(X) - surface.n_used(T), counts["nonmanifold_edges"]
-    if idle or knots:
+    unused, nonmanifold = len(X) - surface.n_used(T), counts["nonmanifold_edges"]
+    if unused or nonmanifold:
         raise ValueError(
-            "coarsen needs a manifold mesh without idle vertices; "
-            f"found {knots} edges of three or more triangles and "
-            f"{idle} vertices without triangle: clean the mesh first"
+            "coarsen needs a manifold mesh without unused vertices; "
+            f"found {nonmanifold} edges of three or more triangles and "
+            f"{unused} vertices without triangle: clean the mesh first"
         )
     return counts
 
@@ -269,7 +270,7 @@ def coarsen(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """Low-resolution mesh of about `n_coarse` vertices, and U that carries functions back (4.1).
+    """Remesh to about `n_coarse` vertices and compute the projection operator U (4.1).
 
     Parameters
     ----------
@@ -277,37 +278,49 @@ def coarsen(
         A clean mesh: ``position`` and ``corner_vertex``, manifold, oriented; boundary and several
         components allowed.
     n_coarse : int
-        Number of vertices to aim at; the result has from 5 % less to 10 % more, or what the
-        topology needs where that is more (handles by the hundred, n_coarse in the hundreds).  A
-        mesh that has no more is kept.
+        Target number of vertices.  The result has 5 % less to 10 % more, or as many as its topology
+        needs (hundreds of handles, n_coarse in the hundreds).  A mesh without more vertices is
+        returned unchanged.
     wrap : bool
-        Coarsen a closed surface wrapped around the mesh, for scans whose inside is of no interest
-        (needs the extra ``s4a[wrap]``).
+        Remesh an alpha wrap of the mesh, for scans with irrelevant interior (needs the extra
+        ``s4a[wrap]``).
     seed, rng : see :mod:`s4a.seeds`
-        The sampling starts at an outermost vertex; another seed starts elsewhere.
+        Seeds select the first sample; seed 0 is an outermost vertex.
 
     Returns
     -------
     xarray.Dataset
-        ``position``, ``corner_vertex``: the coarse mesh, manifold, its vertices in
-        ``sample_vertex`` (-1 where they are no vertex of the mesh); ``edge_vertex``,
-        ``cotan_weight``: W;  ``vertex_area``: A, the area of the original surface carried by U, so
-        that it sums to the original area (of the coarse mesh after wrapping); ``coarse_vertex``,
-        ``coarse_weight (original_vertex, corner)``: U, rows non-negative of sum 1. The attributes
-        count samples, iterations, vertices that went with cut handles (U reaches them, too), Euler
-        characteristic and boundary loops, and say which Laplacian it is ("robust" where triangles
-        are degenerate).
+        ``position``, ``corner_vertex``: the coarse mesh, manifold; ``sample_vertex``: its vertices
+        in the original (-1 if not an original vertex); ``edge_vertex``, ``cotan_weight``: W;
+        ``vertex_area``: A, the original vertex areas distributed by U, whose sum is the original
+        area (after wrapping the areas of the coarse mesh); ``coarse_vertex``,
+        ``coarse_weight (original_vertex, corner)``: U, with non-negative rows of sum 1.  Attributes
+        are the numbers of samples, iterations, and vertices lost with cut handles (U has rows for
+        them), Euler characteristic, boundary loops, and the kind of Laplacian ("robust" for
+        degenerate triangles).
 
     Raises
     ------
     ValueError
-        When the mesh is not clean or an option out of range.
+        If the mesh is not clean or an option is out of range.
+
+    See Also
+    --------
+    s4a.clean : Repair a mesh before it is remeshed.
+    s4a.spectrum : Eigenpairs of the low-resolution mesh.
 
     Notes
     -----
-    A vertex takes its weights from the coarse triangles around the sample of its own geodesic
-    Voronoi cell: U never looks across a thin wall.  Handles and holes inside one cell are lost;
-    handles about a cell thin are cut only if they would need more than 1.1 n_coarse samples.
+    The weights of a vertex come from the coarse triangles around the sample of its geodesic Voronoi
+    cell, so U never crosses a thin wall.  Handles and holes inside one cell are lost; handles about
+    as thin as a cell are cut only if they would need more than 1.1 n_coarse samples.
+
+    References
+    ----------
+    Maggioli, F. et al. (2024). ReMatching: low-resolution representations for scalable shape
+    correspondence. ECCV.
+    Sharp, N. and Crane, K. (2020). A Laplacian for nonmanifold triangle meshes. Computer Graphics
+    Forum 39(5).
 
     Examples
     --------
@@ -324,7 +337,7 @@ def coarsen(
     >>> bool(np.allclose(coarse["coarse_weight"].sum("corner"), 1))
     True
 
-    A brain of 4,000 vertices and of 500, in pictures:
+    A brain with 4,000 and with 500 vertices:
 
     >>> brain = s4a.synthetic.brains(1, 4000)["original/brain_01"].to_dataset()
     >>> few = s4a.coarsen(brain, n_coarse=500)
@@ -359,9 +372,9 @@ def coarsen(
     corner = C[triangle]  # (n, 3)
     if wrap:
         area = vertex_areas(Y, C)
-    else:  # U^T a, so that integrals of functions carried by U are those on the original
-        carried = weight * vertex_areas(X, T)[:, None]
-        area = np.bincount(corner.ravel(), carried.ravel(), len(Y))
+    else:  # U^T a: f and U f have the same integral
+        shares = weight * vertex_areas(X, T)[:, None]
+        area = np.bincount(corner.ravel(), shares.ravel(), len(Y))
     E, w, area, attrs["laplacian"] = laplacian(Y, C, area)
     attrs |= topology(C)
     attrs |= {f"{name}_original": count for name, count in before.items()}

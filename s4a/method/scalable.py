@@ -1,14 +1,12 @@
-"""SCALABLE, the other way to a low resolution (4.1, 5.2, 5.3).
-
-Local functions instead of a coarse mesh.
+"""SCALABLE: local functions instead of a coarse mesh (4.1, 5.2, 5.3).
 
 Magnet & Ovsjanikov, "Scalable and Efficient Functional Map Computations on Dense Meshes" (2023).
-Around every sample of the dense mesh lives a smooth bump of compact support; their values are the
-columns of U, rows of sum 1.  The Laplacian is restricted to their span: U^T W U phi = lambda U^T A
-U phi, and functional maps live in these phi.
+Every sample of the dense mesh has a smooth local function of compact support.  Their values are the
+columns of U, with rows of sum 1.  The Laplacian is restricted to their span, U^T W U phi =
+lambda U^T A U phi, and functional maps use these phi.
 
-:func:`reduce` gives them as a :class:`s4a.method.shape.Shape`, :func:`reduced` as the Dataset that
-is the ``/coarse`` of a study with ``method="scalable"``, of which that shape is made.
+:func:`reduce` returns them as a :class:`s4a.method.shape.Shape`, :func:`reduced` as the Dataset
+``/coarse`` of a study with ``method="scalable"``.
 """
 
 import logging
@@ -30,25 +28,23 @@ from s4a.schema import Array, check_count, dataset, in_unit, require, unit_of
 
 log = logging.getLogger(__name__)
 
-_RADIUS = 3.0  # of the bumps, in radii of a disk of area / samples: about nine reach every vertex
-GROUP = 64  # samples whose paths are looked for together
-# what variables of /coarse are here, where there is no coarse mesh
+_RADIUS = 3.0  # of local functions, in radii of a disk of area / samples: nine overlap on average
+GROUP = 64  # samples whose shortest paths are computed together
+# meaning of the variables of /coarse without a coarse mesh
 _MEANING = {
     "position": "position of the sample",
-    "corner_vertex": "samples whose cells meet: the dual of the cells, for pictures and normals",
+    "corner_vertex": "samples of adjacent cells: the dual mesh, for pictures and normals",
     "vertex_area": "integral of the local function: row sum of U^T A U",
     "edge_vertex": "samples whose local functions, or edges between them, overlap",
     "cotan_weight": "entry of -U^T W U, whose rows sum to 0",
-    "sample_vertex": "vertex of the original mesh that the sample is",
+    "sample_vertex": "vertex of the sample in the original mesh",
     "eigenvalue": "eigenvalue of U^T W U phi = lambda U^T A U phi",
     "eigenfunction": "coefficients phi of the eigenfunction U phi, orthonormal in U^T A U",
 }
 
 
 def bump(distance: Array, radius: float | Array) -> Array:
-    """1 - 3 s^2 + 2 s^3 of s = distance / radius.
-
-    1 and flat at the centre, 0 and flat at the radius.
+    """Evaluate the smooth step 1 - 3 s^2 + 2 s^3 of s = distance / radius, which is 0 for s > 1.
 
     Examples
     --------
@@ -61,11 +57,13 @@ def bump(distance: Array, radius: float | Array) -> Array:
     return 1 - 3 * s**2 + 2 * s**3
 
 
-def spread(X: Array, T: Array, p: int, seed: int = 0) -> tuple[Array, Array, float, sp.csr_array]:
-    """Samples on a mesh such that every vertex lies well inside a bump.
+def covering_samples(
+    X: Array, T: Array, p: int, seed: int = 0
+) -> tuple[Array, Array, float, sp.csr_array]:
+    """Sample a mesh such that every vertex is in the support of a local function.
 
-    Farthest points of position and normal, and where these leave a vertex out along the surface, as
-    behind a thin wall, further ones.
+    Farthest points in position and normal, and more samples if a vertex is far from these along the
+    surface, as behind a thin wall.
 
     Returns
     -------
@@ -78,21 +76,19 @@ def spread(X: Array, T: Array, p: int, seed: int = 0) -> tuple[Array, Array, flo
     """
     E, _, count = unique_edges(T, len(X))
     G = edge_graph(X, E)
-    first = sample_surface(X, T, G, E[count == 1], np.zeros(len(X), bool), min(p, len(X)), seed)
-    radius = _RADIUS * np.sqrt(vertex_areas(X, T).sum() / (np.pi * len(first)))
-    state = voronoi_cells(G, first)
+    initial = sample_surface(X, T, G, E[count == 1], np.zeros(len(X), bool), min(p, len(X)), seed)
+    radius = _RADIUS * np.sqrt(vertex_areas(X, T).sum() / (np.pi * len(initial)))
+    state = voronoi_cells(G, initial)
     while len(far := np.flatnonzero(state.distance > 0.75 * radius)):
         state = add_samples(G, farthest_of_each(state.cell[far], far, state.distance), state)
     return state.sample, state.cell, radius, G
 
 
 def local_functions(X: Array, G: sp.csr_array, sample: Array, radius: float) -> sp.csr_array:
-    """U: bumps of the distance along edges to each sample.
+    """Return U ``(n, p)``: functions of the distance to each sample along edges, rows of sum 1.
 
-    Scaled so that they sum to 1 at every vertex ``(n, p)``.
-
-    No path shorter than the radius leaves the ball of that radius, so each group of near samples
-    looks for its paths among few vertices.
+    Paths shorter than the radius stay in the ball of that radius, so each group of samples searches
+    few vertices.
     """
     tree, middle = cKDTree(X), farthest_points(X[sample], -(-len(sample) // GROUP))
     group = cKDTree(X[sample[middle]]).query(X[sample])[1]
@@ -102,13 +98,13 @@ def local_functions(X: Array, G: sp.csr_array, sample: Array, radius: float) -> 
         near = np.unique(np.concatenate(tree.query_ball_point(X[sample[members]], radius))).astype(
             np.int64
         )
-        away = dijkstra(
+        distance = dijkstra(
             G[near][:, near], indices=np.searchsorted(near, sample[members]), limit=radius
         )
-        which, vertex = np.nonzero(away < radius)
+        which, vertex = np.nonzero(distance < radius)
         rows.append(near[vertex])
         columns.append(members[which])
-        values.append(bump(away[which, vertex], radius))
+        values.append(bump(distance[which, vertex], radius))
     U = sp.csr_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
         (len(X), len(sample)),
@@ -130,14 +126,12 @@ def _reduced_eigenpairs(U, W, area, k):
     # keeps the factor away from the constants
     shift = 1e-6 * stiff.diagonal().sum() / mass.diagonal().sum()
     inverse = spla.LinearOperator(stiff.shape, matvec=factor(stiff + shift * mass), dtype=float)
-    start = 1 + 1e-3 * np.cos(np.arange(U.shape[1]))
-    eigenvalue, Phi = spla.eigsh(
-        stiff, k=k, M=mass, sigma=-shift, OPinv=inverse, v0=start, which="LM"
-    )
+    v0 = 1 + 1e-3 * np.cos(np.arange(U.shape[1]))
+    eigenvalue, Phi = spla.eigsh(stiff, k=k, M=mass, sigma=-shift, OPinv=inverse, v0=v0, which="LM")
     order = np.argsort(eigenvalue)
     eigenvalue, Phi = eigenvalue[order], Phi[:, order]
     zero = np.abs(eigenvalue) < 1e-9 * max(eigenvalue[-1], 1.0)
-    eigenvalue = np.where(zero, 0.0, eigenvalue)  # kernels would take rounding for a frequency
+    eigenvalue = np.where(zero, 0.0, eigenvalue)  # else heat kernels would use rounding errors
     Phi[:, zero] = with_constant_first(Phi[:, zero], U.T @ area)
     Phi = Phi * np.where(area @ (U @ Phi) ** 3 < 0, -1.0, 1.0)
     if zero.any():
@@ -146,14 +140,14 @@ def _reduced_eigenpairs(U, W, area, k):
 
 
 def reduce(mesh: xr.Dataset, *, n_samples: int = 6000, k: int = 100, seed: int = 0) -> Shape:
-    """A clean mesh in the span of local functions around about `n_samples` of its vertices.
+    """Compute the spectrum of a clean mesh in the span of about `n_samples` local functions.
 
     Parameters
     ----------
     mesh : xarray.Dataset
         With ``position`` and ``corner_vertex``.
     n_samples : int
-        A few more are taken where the surface needs them; all vertices where there are fewer.
+        Number of samples; a few more if the surface needs them, at most all vertices.
     k : int
         Number of eigenpairs.
     seed : int
@@ -161,14 +155,18 @@ def reduce(mesh: xr.Dataset, *, n_samples: int = 6000, k: int = 100, seed: int =
     Returns
     -------
     Shape
-        ``low`` has the samples as its vertices and no triangles.  Its eigenvalues are too large, by
-        5 % on a sphere and 12 to 15 % on a head: the bumps cannot follow a linear function exactly.
-        The functions U Phi are what maps need.
+        ``low`` has the samples as vertices and no triangles.  Its eigenvalues are 5 % too large on
+        a sphere and 12 to 15 % on a head, as local functions do not contain linear functions.
 
     Raises
     ------
     ValueError
-        When the mesh lacks its variables, or k is not smaller than the number of samples.
+        If the mesh lacks a variable, or k is not smaller than the number of samples.
+
+    References
+    ----------
+    Magnet, R. and Ovsjanikov, M. (2023). Scalable and efficient functional map computations on
+    dense meshes. Computer Graphics Forum 42(2).
 
     Examples
     --------
@@ -186,17 +184,17 @@ def reduce(mesh: xr.Dataset, *, n_samples: int = 6000, k: int = 100, seed: int =
 def local_space(
     mesh: xr.Dataset, n_samples: int = 6000, seed: int = 0
 ) -> tuple[Array, Array, sp.csr_matrix]:
-    """First half of :func:`reduce`: samples ``(p,)``, cells ``(n,)`` and U ``(n, p)``."""
+    """Return samples ``(p,)``, cells ``(n,)`` and U ``(n, p)``, the first half of `reduce`."""
     X, T = as_arrays(mesh)
     X = Shape(mesh).to_frame(X)
-    sample, cell, radius, G = spread(X, T, n_samples, seed)
+    sample, cell, radius, G = covering_samples(X, T, n_samples, seed)
     return sample, cell, local_functions(X, G, sample, radius)
 
 
 def spectral_space(
     mesh: xr.Dataset, sample: Array, cell: Array, U: sp.csr_matrix, k: int = 100
 ) -> Shape:
-    """Second half of :func:`reduce`: the eigenpairs in the span of U."""
+    """Compute the eigenpairs in the span of U: the second half of :func:`reduce`."""
     if not 1 <= k < len(sample):
         raise ValueError(
             f"k must be from 1 to below the number of samples, {len(sample)}; found {k!r}"
@@ -212,39 +210,39 @@ def spectral_space(
 
 
 def reduced(mesh: xr.Dataset, *, n_coarse: int = 6000, k: int = 100, seed: int = 0) -> xr.Dataset:
-    """A clean mesh in the span of local functions, in the place of a low-resolution mesh (4.1).
+    """Return samples and local functions of a mesh in the form of a low-resolution mesh (4.1).
 
-    It has the variables of :func:`s4a.coarsen` and :func:`s4a.spectrum`, so that all later steps
-    take it.  There is no coarse mesh: the vertices are samples of the original, and the triangles
-    join samples whose geodesic Voronoi cells meet.  They are for pictures and normals, no function
-    depends on them, and they need not be manifold, as behind thin walls.
+    All later steps accept it, as it has the variables of :func:`s4a.coarsen` and
+    :func:`s4a.spectrum`.  The vertices are samples of the original, and the triangles connect
+    samples of adjacent geodesic Voronoi cells.  They serve pictures and normals only, and need not
+    be manifold.
 
     Parameters
     ----------
     mesh : xarray.Dataset
-        As of :func:`s4a.coarsen`.
+        See :func:`s4a.coarsen`.
     n_coarse : int
-        Samples to aim at, see :func:`reduce`.
+        Number of samples, see :func:`reduce`.
     k : int
-        Number of eigenpairs, as of :func:`s4a.spectrum`.
+        Number of eigenpairs, see :func:`s4a.spectrum`.
     seed : int
 
     Returns
     -------
     xarray.Dataset
         ``position``, ``corner_vertex``, ``sample_vertex``: the samples and the dual of their cells;
-        ``sample_cell(original_vertex)``: these cells; ``local_vertex``, ``local_sample``,
-        ``local_weight(entry)``: U, in the place of ``coarse_vertex`` and ``coarse_weight``, as its
-        rows have not three entries but eight to twelve in the mean; ``vertex_area``: its row sums
-        of U^T A U; ``edge_vertex`` and ``cotan_weight``: U^T W U; ``edge_mass``: U^T A U, see
-        :func:`s4a.method.spectral.unit_mass`; ``eigenvalue``, ``eigenfunction``: phi, which U takes
-        to all vertices.  The attribute ``method`` is "scalable"; the others are as of
+        ``sample_cell(original_vertex)``: the cells; ``local_vertex``, ``local_sample``,
+        ``local_weight(entry)``: U, instead of ``coarse_vertex`` and ``coarse_weight``, as rows have
+        eight to twelve entries on average; ``vertex_area``: row sums of U^T A U; ``edge_vertex``
+        and ``cotan_weight``: U^T W U; ``edge_mass``: U^T A U, see
+        :func:`s4a.method.spectral.unit_mass`; ``eigenvalue``, ``eigenfunction``: phi, with U phi at
+        all vertices.  The attribute ``method`` is "scalable"; for the others see
         :func:`s4a.coarsen`.
 
     Raises
     ------
     ValueError
-        When the mesh is not clean, an option out of range, or the solver finds no eigenpairs.
+        If the mesh is not clean, an option is out of range, or the solver does not converge.
 
     Examples
     --------
@@ -265,17 +263,17 @@ def reduced(mesh: xr.Dataset, *, n_coarse: int = 6000, k: int = 100, seed: int =
     check_clean(X, T)
     sample, cell, U = local_space(mesh, n_coarse, seed)
     p = len(sample)
-    possible = min(int(k), p - 2)
-    if possible < 1:
-        raise ValueError(f"a spectrum needs at least 3 samples, found {p}")
+    k_possible = min(int(k), p - 2)
+    if k_possible < 1:
+        raise ValueError(f"a spectrum needs at least 3 samples; found {p}")
     E, w, area, kind = laplacian(X, T, vertex_areas(X, T))
     total, W = area.sum(), stiffness(E, w, len(X))
     if not np.isfinite(w).all():
-        raise ValueError("finite cotan weights needed; triangles are too thin to have them")
+        raise ValueError("cotan weights must be finite; some triangles are too thin")
     try:
-        eigenvalue, Phi, mass = _reduced_eigenpairs(U, W, area / total, possible)
+        eigenvalue, Phi, mass = _reduced_eigenpairs(U, W, area / total, k_possible)
     except RuntimeError as error:  # of the factor or of ARPACK
-        raise ValueError(f"no {possible} eigenpairs of {p} local functions: {error}") from error
+        raise ValueError(f"no {k_possible} eigenpairs of {p} local functions: {error}") from error
     attrs: dict[str, int | str] = {
         "method": "scalable",
         "n_coarse": int(n_coarse),
@@ -285,8 +283,8 @@ def reduced(mesh: xr.Dataset, *, n_coarse: int = 6000, k: int = 100, seed: int =
         "laplacian": kind,
         "zero_eigenvalues": int((eigenvalue == 0).sum()),
     }
-    if possible < k:
-        log.warning("k reduced from %d to %d: the mesh has only %d samples", k, possible, p)
+    if k_possible < k:
+        log.warning("k reduced from %d to %d: the mesh has only %d samples", k, k_possible, p)
         attrs["k_reduced_from"] = int(k)
     stiff = sp.csr_matrix(U.T @ W @ U)
     i, j = sp.triu(abs(stiff) + abs(mass), 1).nonzero()

@@ -1,6 +1,6 @@
-"""A shape (3.1, 3.3, 4.1): one surface at two resolutions, in one frame, with its functions and U.
+"""A shape (3.1, 3.3, 4.1): a surface at two resolutions, in one frame, with eigenfunctions and U.
 
-Every step of the method takes shapes, or the :class:`Basis` of one at one resolution.
+The steps of the method use shapes, or the :class:`Basis` of a shape at one resolution.
 """
 
 from collections.abc import Callable
@@ -23,45 +23,44 @@ from s4a.method.spectral import Diffusion, project, unit_area, unit_mass
 from s4a.options import N_CENTRAL, N_SAMPLES
 from s4a.schema import Array
 
-N_PAIRED = 300  # spread vertices of a shape that rigid alignment pairs
-# One standard deviation of a field that guides, beside positions by POSITION_WEIGHT: as much as 2 %
-# of sqrt(area).  With twice as much the labels of cortex are carried over less well
+N_PAIRED = 300  # samples of a shape that rigid alignment pairs
+# of one standard deviation of a field, relative to positions times POSITION_WEIGHT: as much as 2 %
+# of sqrt(area).  With twice the weight, labels of cortex are transferred less accurately
 FIELD_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
 class Basis:
-    """A surface of unit area at one resolution, and the functions on it that maps are made of.
+    """A surface of unit area at one resolution, with the basis of functional maps.
 
     Parameters
     ----------
     X : float ndarray (n, 3)
         Vertices, in the frame of the shape.
     T : int ndarray (m, 3)
-        Triangles; none where the vertices are samples of :func:`s4a.method.scalable.reduce`.
+        Triangles; empty for samples of :func:`s4a.method.scalable.reduce`.
     area : float ndarray (n,)
         Vertex areas, of sum 1.
     Phi : float ndarray (p, k)
-        Functions on the vertices, p = n; or on those of the low resolution, where there is U.
+        Functions on the vertices, p = n; with U, functions on the low-resolution vertices.
     eigenvalue : float ndarray (k,)
-        Theirs, for unit area; none where nothing asks for them.
+        Eigenvalues for unit area, if needed.
     mass : float ndarray (p,) or sparse matrix (p, p), optional
-        What Phi is orthonormal in; the areas by default.
+        Mass matrix in which Phi is orthonormal; the areas by default.
     U : sparse matrix (n, p), optional
-        Takes functions from the low resolution to the n vertices.  U Phi is never formed.
+        Projection of functions from the low resolution to the n vertices.  U Phi is never formed.
     near_coarse : int ndarray (s,), optional
-        Vertices by which fields are projected, and that iterations of registration look at; all by
-        default.
+        Vertices used to project fields, and in iterations of registration; all by default.
     area_weighted : bool
-        Whether these vertices weigh by their areas when a field is projected.
-    lifted : bool
-        Whether Phi has a row for each of the n vertices although there is U.
+        Whether to weight these vertices by area when a field is projected.
+    refined : bool
+        Whether Phi has a row for each of the n vertices, although U is given.
     surface_normals : float ndarray (n, 3), optional
-        Unit normals of the finer surface that the vertices are of; by default those of the mesh.
+        Unit normals of a finer surface at the vertices; by default those of the mesh.
     landmarks : dict of str to int
-        The vertex at each landmark that was given, or nearest to it.
+        Nearest vertex of each landmark.
     fields : dict of str to float ndarray (n,)
-        Those that were given to guide, see ``_smooth_fields``.
+        Fields that guide the registration, see ``_smooth_fields``.
     """
 
     X: Array
@@ -73,7 +72,7 @@ class Basis:
     U: sp.csr_matrix | None = None
     near_coarse: Array | slice | None = None
     area_weighted: bool = True
-    lifted: bool = False
+    refined: bool = False
     surface_normals: Array | None = None
     landmarks: dict[str, int] = field(default_factory=dict)
     fields: dict[str, Array] = field(default_factory=dict)
@@ -86,53 +85,53 @@ class Basis:
 
     @property
     def k(self) -> int:
-        """How many functions there are."""
+        """Number of functions."""
         return self.Phi.shape[1]
 
-    def first(self, k: int) -> "Basis":
-        """The same surface with its first k functions."""
+    def truncated(self, k: int) -> "Basis":
+        """Return the surface with its first k functions."""
         return replace(self, Phi=self.Phi[:, :k], eigenvalue=self.eigenvalue[:k])
 
     def moved_to(self, X: Array) -> "Basis":
-        """The same surface where its vertices have moved to X ``(n, 3)``, as registered."""
+        """Return the surface with vertices moved to X ``(n, 3)``, as registered."""
         return replace(self, X=X, surface_normals=None)
 
     def extend(self, F: Array) -> Array:
-        """Functions of the low resolution at all vertices: U F ``(n, q)`` in single precision.
+        """Extend functions of the low resolution to all vertices: U F ``(n, q)``, single precision.
 
-        Those that have a value at every vertex stay as they are.
+        Functions with a row for every vertex are returned unchanged.
         """
         if self.U is None or len(F) == len(self.X):
             return F
         return self.U @ F.astype(np.float32)
 
     def field(self, c: Array) -> Array:
-        """The field U Phi c ``(n, 3)`` with coefficients c ``(q, 3)`` of the first functions."""
+        """Return the field U Phi c ``(n, 3)`` with coefficients c ``(q, 3)``."""
         low = self.Phi[:, : len(c)] @ c
-        return low if self.U is None or self.lifted else self.U @ low
+        return low if self.U is None or self.refined else self.U @ low
 
     @cached_property
     def coefficients(self) -> Callable[..., Any]:
-        """Coefficients of a field given at the vertices near coarse ones, see :func:`smoother`."""
+        """Projection of a field at the vertices near coarse ones, see :func:`smoother`."""
         area = self.area[self.near_coarse]
         weight = area if self.area_weighted else np.ones_like(area)
-        if self.U is None or self.lifted:
+        if self.U is None or self.refined:
             return smoother(self.Phi[self.near_coarse], weight)
         return smoother(self.Phi, weight, self.U[self.near_coarse])
 
     def sample_vertices_of(self, n: int = N_SAMPLES) -> Array:
-        """Vertices ``(<= n,)`` spread over the surface; all in their order where n is 0."""
+        """Return farthest-point samples ``(<= n,)``; all vertices in that order if n is 0."""
         if N_SAMPLES < len(self.X) and 0 < n <= N_SAMPLES:
-            return self._spread[:n]  # each is the farthest from those before it
+            return self._samples[:n]
         return farthest_points(self.X, n or len(self.X))
 
     @cached_property
-    def _spread(self) -> Array:
+    def _samples(self) -> Array:
         return many_farthest_points(self.X, N_SAMPLES, center=self.X.mean(0))
 
     @cached_property
     def cloud(self) -> Cloud:
-        """The vertices as rigid alignment takes them."""
+        """The vertices in the form that rigid alignment needs."""
         return Cloud(self.X, self.area, cKDTree(self.X), self.sample_vertices_of(N_PAIRED))
 
     @cached_property
@@ -141,7 +140,7 @@ class Basis:
         return tree_over(features(self.X, self.normals))
 
     def guided_tree(self, names: tuple[str, ...]) -> cKDTree:
-        """That over position, normal and some of the fields, 6 dims and one for each."""
+        """Return the KD-tree over position, normal and some fields, 6 dims and one for each."""
         if not names:
             return self.tree
         if names not in self._guided:
@@ -159,9 +158,9 @@ class Basis:
         return vertex_normals(self.X, self.T)
 
     def normals_at(self, X: Array) -> Array:
-        """Unit normals of the surface ``(n, 3)`` where the vertices have moved to X.
+        """Return unit normals ``(n, 3)`` after moving the vertices to X.
 
-        Those of a finer surface turn with all of the mesh, and then as its normals do there.
+        Normals of a finer surface are rotated with the mesh, then like its normals.
         """
         moved = vertex_normals(X, self.T)
         if self.surface_normals is None:
@@ -176,7 +175,7 @@ class Basis:
 
     @cached_property
     def boundary(self) -> Array:
-        """Boundary edges ``(r, 2)``, in the direction in which their triangles go around."""
+        """Boundary edges ``(r, 2)``, oriented like their triangles."""
         _, edge_of, count = surface.unique_edges(self.T, len(self.X))
         return surface.directed_edges(self.T)[count[edge_of] == 1]
 
@@ -192,9 +191,9 @@ class Basis:
 
     @cached_property
     def outwards(self) -> Array:
-        """Rows of the vertices near coarse ones by their distance from the centre.
+        """Rows of the vertices near coarse ones, sorted by distance from the centre.
 
-        An order that neither pose nor numbering changes.
+        The order does not depend on pose or numbering.
         """
         from_center = self.X[self.near_coarse] - self.area @ self.X
         return np.argsort((from_center**2).sum(1), kind="stable")
@@ -202,23 +201,23 @@ class Basis:
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape at both resolutions; what is not asked for is neither read nor computed.
+    """A shape at both resolutions, read and computed on access.
 
-    Its frame is x -> (x - center) / size with the area centroid and the square root of the total
-    area of the original mesh; of the coarse mesh where the original is not given.
+    The frame is x -> (x - center) / size with the area centroid and the square root of the total
+    area of the original mesh, or of the coarse mesh if the original is not given.
 
     Parameters
     ----------
     original : xarray.Dataset, optional
-        The clean mesh: ``position``, ``corner_vertex``; empty where no step needs it.
+        The clean mesh: ``position``, ``corner_vertex``; may be empty if no step needs it.
     coarse : xarray.Dataset, optional
-        As :func:`s4a.coarsen` and :func:`s4a.spectrum` make it, or
-        :func:`s4a.method.refined_eigenfunctions.lifted`, or :func:`s4a.method.scalable.reduced`:
-        then what is called coarse are samples.
+        Low-resolution mesh of :func:`s4a.coarsen` and :func:`s4a.spectrum`, of
+        :func:`s4a.method.refined_eigenfunctions.with_refined_eigenfunctions`, or samples of
+        :func:`s4a.method.scalable.reduced`.
     n_projected : int
-        Vertices of ``full`` by which fields are projected, those nearest to coarse ones; 0 for all.
+        Vertices of ``full`` used to project fields, those nearest to coarse ones; 0 for all.
     area_weighted : bool
-        Whether they weigh by their areas then.
+        Whether to weight them by area.
     """
 
     original: xr.Dataset = field(default_factory=xr.Dataset)
@@ -228,14 +227,14 @@ class Shape:
 
     @classmethod
     def of(cls, original: xr.Dataset, **parts: Any) -> "Shape":
-        """A shape whose ``low``, ``full``, ``U`` and ``cell`` were made in another way."""
+        """Return a shape with given ``low``, ``full``, ``U`` and ``cell``."""
         shape = cls(original)
-        vars(shape).update(parts)  # in the place of the cached properties
+        vars(shape).update(parts)  # replaces the cached properties
         return shape
 
     @cached_property
     def frame(self) -> tuple[Array, float]:
-        """Center ``(3,)`` and size, in the unit of the input."""
+        """Centre ``(3,)`` and size, in the unit of the input."""
         if not self.original:
             area, X = self.coarse["vertex_area"].values, self.coarse["position"].values
             return area / area.sum() @ X, np.sqrt(area.sum())
@@ -247,20 +246,20 @@ class Shape:
         return vertex_areas(*as_arrays(self.original))
 
     def to_frame(self, points: Array) -> Array:
-        """Points ``(p, 3)`` in the unit of the input, in the frame."""
+        """Convert points ``(p, 3)`` from the unit of the input to the frame."""
         center, size = self.frame
         return (points - center) / size
 
     def from_frame(self, points: Array) -> Array:
-        """Points ``(p, 3)`` of the frame, in the unit of the input."""
+        """Convert points ``(p, 3)`` from the frame to the unit of the input."""
         center, size = self.frame
         return points * size + center
 
     @cached_property
     def U(self) -> sp.csr_matrix:
-        """The projection operator of 4.1 ``(n, n_coarse)``: three barycentric weights a row.
+        """Projection operator of 4.1 ``(n, n_coarse)``: three barycentric weights per row.
 
-        Of SCALABLE the local functions, rows of sum 1.
+        In SCALABLE the local functions, with rows of sum 1.
         """
         if self.is_sampled:
             row, column, weight = (
@@ -270,25 +269,25 @@ class Shape:
             return sp.csr_matrix((weight, (row, column)), shape)
         corners = self.coarse["coarse_vertex"].values  # (n, 3)
         weights = self.coarse["coarse_weight"].values  # (n, 3), rows of sum 1
-        every = np.arange(len(corners))
-        return interpolation_matrix(corners, every, weights, self.coarse.sizes["vertex"])
+        rows = np.arange(len(corners))
+        return interpolation_matrix(corners, rows, weights, self.coarse.sizes["vertex"])
 
     @cached_property
     def landmarks(self) -> tuple[list[str], sp.csr_matrix]:
-        """Names of the landmarks that guide, and barycentric weights ``(l, n)`` of each."""
+        """Names of the guiding landmarks, and their barycentric weights ``(l, n)``."""
         mesh = self.original
         if "guide_triangle" not in mesh:
             return [], sp.csr_matrix((0, mesh.sizes["vertex"]))
         _, T = as_arrays(mesh)
         names = mesh["guide_name"].values.tolist()
-        place = mesh["guide_triangle"].values, mesh["guide_barycentric"].values
-        return names, interpolation_matrix(T, *place, mesh.sizes["vertex"])
+        triangle, weights = mesh["guide_triangle"].values, mesh["guide_barycentric"].values
+        return names, interpolation_matrix(T, triangle, weights, mesh.sizes["vertex"])
 
     @cached_property
     def cell(self) -> Array:
-        """The coarse vertex that weighs most at each original vertex ``(n,)``.
+        """Coarse vertex with the largest weight at each original vertex ``(n,)``.
 
-        Of SCALABLE the sample that is nearest along edges.
+        In SCALABLE the nearest sample along edges.
         """
         if self.is_sampled:
             return self.coarse["sample_cell"].values
@@ -308,9 +307,9 @@ class Shape:
 
     @cached_property
     def W(self) -> sp.csr_matrix:
-        """Stiffness matrix of the low resolution ``(n_coarse, n_coarse)``; of SCALABLE U^T W U.
+        """Stiffness matrix at low resolution ``(n_coarse, n_coarse)``; in SCALABLE U^T W U.
 
-        A study that was made smaller to be handed on may lack it: then it is computed again.
+        Computed again if a reduced study lacks it.
         """
         if "cotan_weight" in self.coarse:
             E, w = (self.coarse[name].values for name in ("edge_vertex", "cotan_weight"))
@@ -320,56 +319,56 @@ class Shape:
 
     @cached_property
     def diffusion(self) -> Diffusion:
-        """Of heat at low resolution."""
+        """Heat diffusion at low resolution."""
         return Diffusion(self.low.area, self.W)
 
     @cached_property
     def low_on_surface(self) -> Basis:
-        """The coarse mesh with the normals of the original one.
+        """The coarse mesh with the normals of the original mesh.
 
-        Its own differ from these: whoever looks for nearest points by normals, too, would be drawn
-        aside, and a shape registered to itself would move.
+        With the normals of the coarse mesh, nearest points in position and normal would be biased,
+        and a shape registered to itself would move.
         """
         low = self.low
-        of_file = self.coarse["sample_vertex"].values  # (n_coarse,), -1 for none
-        normals = self.full.normals[of_file]
-        normals[of_file < 0] = low.normals[of_file < 0]
+        vertex = self.coarse["sample_vertex"].values  # (n_coarse,), -1 if not an original vertex
+        normals = self.full.normals[vertex]
+        normals[vertex < 0] = low.normals[vertex < 0]
         return replace(low, surface_normals=normals)
 
     @cached_property
     def full(self) -> Basis:
-        """The original mesh and the functions U Phi, or lifted ones; its areas, of sum 1."""
-        (X, T), low, lifted = as_arrays(self.original), self.low, self.has_refined_eigenfunctions
+        """The original mesh with areas of sum 1, and the functions U Phi or refined ones."""
+        (X, T), low, refined = as_arrays(self.original), self.low, self.has_refined_eigenfunctions
         X, area = self.to_frame(X), self._area / self._area.sum()
-        Phi = self.coarse["refined_eigenfunction"].values if lifted else low.Phi
+        Phi = self.coarse["refined_eigenfunction"].values if refined else low.Phi
         functions = Phi, low.eigenvalue, low.mass, self.U, self.near_coarse
-        full = Basis(X, T, area, *functions, self.area_weighted, lifted)
+        full = Basis(X, T, area, *functions, self.area_weighted, refined)
         fields = {name: self.U @ values for name, values in low.fields.items()}
         return replace(full, landmarks=vertices_of_landmarks(self.original), fields=fields)
 
     @property
     def is_sampled(self) -> bool:
-        """Whether the low resolution is that of :mod:`s4a.method.scalable`."""
+        """Whether the low resolution has samples of :mod:`s4a.method.scalable`."""
         return "local_weight" in self.coarse
 
     @property
     def has_refined_eigenfunctions(self) -> bool:
-        """Whether the functions of ``full`` are lifted ones, and not U Phi."""
+        """Whether the functions of ``full`` are refined instead of U Phi."""
         return "refined_eigenfunction" in self.coarse
 
     def functions(self, A: Array) -> Array:
-        """The functions Phi A that full resolution compares, A ``(k, m)``.
+        """Return the functions Phi A for the match at full resolution, A ``(k, m)``.
 
-        At coarse vertices, as U takes them from there; lifted ones at all.
+        At coarse vertices; refined eigenfunctions at all vertices.
         """
         basis = self.full if self.has_refined_eigenfunctions else self.low
         return basis.Phi[:, : len(A)] @ A.astype(basis.Phi.dtype)
 
     @cached_property
     def near_coarse(self) -> Array:
-        """Original vertices nearest to coarse ones, by their weights in U; all of few.
+        """Original vertices nearest to coarse ones, by weight in U; all of a small mesh.
 
-        Of SCALABLE, whose weights also say how dense its samples are, by their distance.
+        In SCALABLE by distance, as weights also depend on the sample density.
         """
         n = self.n_projected
         if n == 0 or self.coarse.sizes["original_vertex"] <= n:
@@ -383,7 +382,7 @@ class Shape:
 
 
 def vertices_of_landmarks(mesh: xr.Dataset) -> dict[str, int]:
-    """Name -> vertex of the landmarks that guide; of those within a triangle its nearest corner."""
+    """Return name -> vertex of the guiding landmarks; within a triangle its nearest corner."""
     if "guide_name" not in mesh:
         return {}
     if "guide_vertex" in mesh:
@@ -396,7 +395,7 @@ def vertices_of_landmarks(mesh: xr.Dataset) -> dict[str, int]:
 
 
 def features_of(mesh: xr.Dataset) -> dict[str, Array]:
-    """The fields of :func:`s4a.with_features`, by name ``(n,)``; none where a mesh has none."""
+    """Return the fields of :func:`s4a.with_features` by name ``(n,)``."""
     if "feature_name" not in mesh:
         return {}
     names = mesh["feature_name"].values.tolist()
@@ -404,35 +403,35 @@ def features_of(mesh: xr.Dataset) -> dict[str, Array]:
 
 
 def _smooth_fields(coarse, low):
-    """Fields that guide as the functions of a surface have them, of mean 0 and variance 1.
+    """Guiding fields, standardised, times their weights, and projected onto the eigenfunctions.
 
-    Times their weights.  Noise from vertex to vertex would draw matches aside.  NaN counts as the
-    mean; fields that are the same everywhere say nothing, and are left out.
+    The projection removes noise, which would bias matches.  NaN is replaced by the mean; constant
+    fields are omitted.
     """
-    found = {}
+    fields = {}
     for i, (name, values) in enumerate(features_of(coarse).items()):
-        known = np.isfinite(values)
-        share = np.where(known, low.area, 0) / low.area[known].sum()
-        around = np.where(known, values - share @ np.where(known, values, 0), 0)
-        spread = np.sqrt(share @ around**2)
-        if spread > 1e-12 * abs(values[known]).max():
-            around *= coarse["feature_weight"].values[i] / spread
-            found[name] = low.Phi @ project(low.Phi, low.mass, around)
-    return found
+        finite = np.isfinite(values)
+        share = np.where(finite, low.area, 0) / low.area[finite].sum()
+        centered = np.where(finite, values - share @ np.where(finite, values, 0), 0)
+        deviation = np.sqrt(share @ centered**2)
+        if deviation > 1e-12 * abs(values[finite]).max():
+            centered *= coarse["feature_weight"].values[i] / deviation
+            fields[name] = low.Phi @ project(low.Phi, low.mass, centered)
+    return fields
 
 
 def common_fields(source: Basis, target: Basis) -> tuple[str, ...]:
-    """Names of the fields that guide both."""
+    """Return the names of the guiding fields of both shapes."""
     return tuple(name for name in target.fields if name in source.fields)
 
 
 def field_columns(basis: Basis, names: tuple[str, ...]) -> Array:
-    """Fields ``(n, f)`` as columns of rows in which nearest points are searched."""
+    """Return weighted fields ``(n, f)`` as columns for the nearest-neighbour search."""
     return FIELD_WEIGHT * np.stack([basis.fields[name] for name in names], axis=1)
 
 
 def corresponding_landmarks(source: Basis, target: Basis) -> tuple[Array, Array]:
-    """The vertices of source and target ``(l,)`` at the landmarks that both have by name."""
+    """Return the vertices of source and target ``(l,)`` at landmarks of the same name."""
     names = [name for name in target.landmarks if name in source.landmarks]
     at_source, at_target = (
         np.array([basis.landmarks[name] for name in names], int) for basis in (source, target)

@@ -1,4 +1,4 @@
-"""Spectrum (3.3): the basis Phi of eigenfunctions, coefficients Phi^T A f, and functions from them.
+"""Spectrum (3.3): eigenfunctions Phi, coefficients Phi^T A f, and functions from coefficients.
 
 L phi = lambda phi with L = A^-1 W, W the cotan stiffness matrix and A the lumped vertex areas, all
 for the surface scaled to unit area.
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 def eigenpairs(E: Array, w: Array, area: Array, k: int) -> tuple[Array, Array]:
-    """The k smallest eigenpairs of W phi = lambda A phi, for the surface scaled to unit area.
+    """Compute the k smallest eigenpairs of W phi = lambda A phi, for the surface of unit area.
 
     Parameters
     ----------
@@ -36,8 +36,8 @@ def eigenpairs(E: Array, w: Array, area: Array, k: int) -> tuple[Array, Array]:
     -------
     eigenvalue : float ndarray (k,)
     Phi : float ndarray (n, k)
-        Phi^T A Phi = I for areas of sum 1; the first is the constant 1, also where several pieces
-        have as many eigenvalues 0; the sign of a column makes its third moment positive.
+        Phi^T A Phi = I for areas of sum 1.  The first is the constant 1, also if several components
+        have eigenvalue 0.  Signs are chosen for a positive third moment.
     """
     n = len(area)
     a = area / area.sum()
@@ -46,8 +46,8 @@ def eigenpairs(E: Array, w: Array, area: Array, k: int) -> tuple[Array, Array]:
     S = (root @ stiffness(E, w, n) @ root).tocsc()  # (n, n)
     shift = 1e-8 * S.diagonal().mean()  # keeps the factor away from the null space
     inverse = spla.LinearOperator((n, n), matvec=factor(S + shift * sp.identity(n)), dtype=float)
-    start = np.sqrt(a) + 1e-3 * np.cos(np.arange(n))  # ARPACK's own differs from run to run
-    eigenvalue, V = spla.eigsh(S, k=k, sigma=-shift, OPinv=inverse, v0=start, which="LM")
+    v0 = np.sqrt(a) + 1e-3 * np.cos(np.arange(n))  # the default of ARPACK is random
+    eigenvalue, V = spla.eigsh(S, k=k, sigma=-shift, OPinv=inverse, v0=v0, which="LM")
     order = np.argsort(eigenvalue)
     eigenvalue = eigenvalue[order]
     Phi = V[:, order] / np.sqrt(a)[:, None]  # (n, k)
@@ -61,16 +61,16 @@ def eigenpairs(E: Array, w: Array, area: Array, k: int) -> tuple[Array, Array]:
 
 
 def with_constant_first(Z: Array, area: Array) -> Array:
-    """Functions ``(n, z)`` of eigenvalue 0, turned so that the first is the constant 1.
+    """Rotate the functions ``(n, z)`` of eigenvalue 0 so that the first is the constant 1.
 
-    Of several pieces the solver gives any functions that are constant on each.
+    For several components the solver returns arbitrary functions that are constant on each.
 
     Parameters
     ----------
     Z : float ndarray (n, z)
         Orthonormal.
     area : float ndarray (n,)
-        Integrals of the functions that Z holds the coefficients of: vertex areas of sum 1.
+        Integrals of the functions whose coefficients are Z: vertex areas of sum 1.
     """
     if Z.shape[1] < 2:
         return Z
@@ -82,7 +82,7 @@ def with_constant_first(Z: Array, area: Array) -> Array:
 
 
 def factor(S: sp.spmatrix) -> Callable[[Array], Array]:
-    """The function that solves S x = b, for S sparse, symmetric and positive definite."""
+    """Return a solver of S x = b, for S sparse, symmetric and positive definite."""
     return spla.splu(
         S.tocsc(),
         permc_spec="MMD_AT_PLUS_A",
@@ -92,14 +92,14 @@ def factor(S: sp.spmatrix) -> Callable[[Array], Array]:
 
 
 class Diffusion:
-    """Implicit steps of heat diffusion, (A + time W) x = b; the factors of a time are kept.
+    """Implicit steps of heat diffusion, (A + time W) x = b, with cached factors.
 
     Parameters
     ----------
     area : float ndarray (n,)
-        A.
+        Vertex areas, A.
     W : sparse matrix (n, n)
-        Stiffness.
+        Stiffness matrix.
 
     Examples
     --------
@@ -116,24 +116,24 @@ class Diffusion:
         self.W = W
         self._steps: dict[float, Callable[[Array], Array]] = {}
 
-    def step(self, time: float, pinned: sp.sparray | None = None) -> Callable[[Array], Array]:
-        """The function that solves for x ``(n, q)``; with `pinned` added to A none is kept."""
-        if pinned is not None:
-            return factor(self.A + pinned + time * self.W)
+    def step(self, time: float, extra: sp.sparray | None = None) -> Callable[[Array], Array]:
+        """Return a solver for x ``(n, q)``; with an `extra` term of the matrix it is not cached."""
+        if extra is not None:
+            return factor(self.A + extra + time * self.W)
         if time not in self._steps:
             self._steps[time] = factor(self.A + time * self.W)
         return self._steps[time]
 
 
 def project(Phi: Array, area: Array | sp.spmatrix, f: Array) -> Array:
-    """Coefficients a = Phi^T A f of a function ``(k,)`` or of several ``(k, d)``.
+    """Return the coefficients Phi^T A f of a function ``(k,)`` or of several ``(k, d)``.
 
     Parameters
     ----------
     Phi : float ndarray (n, k)
         Orthonormal in the areas.
     area : float ndarray (n,), of sum 1, or sparse matrix (n, n)
-        A, where it is not diagonal: :func:`unit_mass`.
+        A, see :func:`unit_mass`.
     f : float ndarray (n,) or (n, d)
     """
     if f.ndim > 1:
@@ -144,29 +144,39 @@ def project(Phi: Array, area: Array | sp.spmatrix, f: Array) -> Array:
 
 
 def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
-    """Area-orthonormal Laplace-Beltrami eigenpairs of a low-resolution mesh (3.3).
+    """Compute the Laplace-Beltrami eigenpairs of a low-resolution mesh (3.3).
 
     Parameters
     ----------
     mesh : xarray.Dataset
-        Needs ``vertex_area``, ``edge_vertex`` and ``cotan_weight`` as :func:`s4a.coarsen` gives
-        them.  A spectrum that it has is replaced, with all that depends on its modes.
+        With ``vertex_area``, ``edge_vertex`` and ``cotan_weight`` of :func:`s4a.coarsen`.  An
+        existing spectrum is replaced, and variables that depend on it are dropped.
     k : int
-        Number of eigenpairs.  Where the mesh has too few vertices for it, as many as it can carry
-        are given and the attribute ``k_reduced_from`` says so.
+        Number of eigenpairs.  It is reduced if the mesh has too few vertices, and the attribute
+        ``k_reduced_from`` is set.
 
     Returns
     -------
     xarray.Dataset
         The mesh with ``eigenvalue(eigenpair)`` and ``eigenfunction(vertex, eigenpair)`` for unit
         area: A^-1 W phi = lambda phi, Phi^T A Phi = I with A of trace 1.  The attribute
-        ``zero_eigenvalues`` counts the connected pieces.
+        ``zero_eigenvalues`` is the number of connected components.
 
     Raises
     ------
     ValueError
-        When k is not a positive integer, the mesh has fewer than 3 vertices or is of samples of
-        SCALABLE, or the solver finds no eigenpairs.
+        If k is not a positive integer, the mesh has fewer than 3 vertices or holds samples of
+        SCALABLE, or the solver does not converge.
+
+    See Also
+    --------
+    s4a.coarsen : Make a low-resolution mesh.
+    reconstruct : Truncate a function to the first eigenfunctions.
+
+    References
+    ----------
+    Pinkall, U. and Polthier, K. (1993). Computing discrete minimal surfaces and their conjugates.
+    Experimental Mathematics 2(1).
 
     Examples
     --------
@@ -175,54 +185,54 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
 
     >>> import numpy as np
     >>> import s4a
-    >>> found = s4a.spectrum(s4a.coarsen(s4a.synthetic.sphere(2000), n_coarse=1000), k=9)
-    >>> (found["eigenvalue"].values / (4 * np.pi)).round().tolist()
+    >>> ball = s4a.spectrum(s4a.coarsen(s4a.synthetic.sphere(2000), n_coarse=1000), k=9)
+    >>> (ball["eigenvalue"].values / (4 * np.pi)).round().tolist()
     [0.0, 2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]
-    >>> Phi = found["eigenfunction"].values
-    >>> waves = {f"mode {i}": Phi[:, i] for i in (1, 4, 8)}
-    >>> s4a.show.charts.surfaces(dict.fromkeys(waves, found), waves, label="eigenfunction")
+    >>> Phi = ball["eigenfunction"].values
+    >>> waves = {f"eigenfunction {i}": Phi[:, i] for i in (1, 4, 8)}
+    >>> s4a.show.charts.surfaces(dict.fromkeys(waves, ball), waves, label="eigenfunction")
     <TiledFigure ...>
     """
     require(mesh, "vertex_area", "edge_vertex", "cotan_weight", what="mesh")
     check_count("k", k, 1)
     if "edge_mass" in mesh:
         raise ValueError(
-            "a low-resolution mesh of s4a.coarsen needed; samples of SCALABLE come with their "
-            "spectrum: make them again with another k"
+            "a low-resolution mesh of s4a.coarsen is needed; samples of SCALABLE have a "
+            "spectrum: compute them again with another k"
         )
     n = mesh.sizes["vertex"]
-    possible = min(int(k), n - 2)
-    if possible < 1:
-        raise ValueError(f"a spectrum needs at least 3 vertices, found {n}")
+    k_possible = min(int(k), n - 2)
+    if k_possible < 1:
+        raise ValueError(f"a spectrum needs at least 3 vertices; found {n}")
     E, w = mesh["edge_vertex"].values, mesh["cotan_weight"].values
     if not np.isfinite(w).all():
-        raise ValueError("finite cotan weights needed; triangles are too thin to have them")
+        raise ValueError("cotan weights must be finite; some triangles are too thin")
     try:
-        eigenvalue, Phi = eigenpairs(E, w, mesh["vertex_area"].values, possible)
+        eigenvalue, Phi = eigenpairs(E, w, mesh["vertex_area"].values, k_possible)
     except RuntimeError as error:  # of the factor or of ARPACK
         raise ValueError(
-            f"no {possible} eigenpairs of a mesh with {n} vertices: {error}"
+            f"no {k_possible} eigenpairs of a mesh with {n} vertices: {error}"
         ) from error
-    mesh = mesh.drop_dims("eigenpair", errors="ignore")  # of the spectrum before
+    mesh = mesh.drop_dims("eigenpair", errors="ignore")  # of an earlier spectrum
     mesh.attrs.pop("k_reduced_from", None)
     attrs = dict(mesh.attrs, zero_eigenvalues=int((eigenvalue == 0).sum()))
-    if possible < k:
-        log.warning("k reduced from %d to %d: the mesh has only %d vertices", k, possible, n)
+    if k_possible < k:
+        log.warning("k reduced from %d to %d: the mesh has only %d vertices", k, k_possible, n)
         attrs["k_reduced_from"] = int(k)
     return xr.merge([mesh, dataset(eigenvalue=eigenvalue, eigenfunction=Phi)]).assign_attrs(attrs)
 
 
 def unit_area(mesh: xr.Dataset) -> Array:
-    """Vertex areas of a mesh scaled to sum 1 ``(n,)``: the A in which Phi is orthonormal."""
+    """Return vertex areas scaled to sum 1 ``(n,)``: the A in which Phi is orthonormal."""
     area = mesh["vertex_area"].values
     return area / area.sum()
 
 
 def unit_mass(mesh: xr.Dataset) -> Array | sp.csr_matrix:
-    """The A in which Phi is orthonormal: :func:`unit_area`, or of SCALABLE U^T A U ``(n, n)``.
+    """Return the A in which Phi is orthonormal: :func:`unit_area`, or U^T A U in SCALABLE.
 
-    That has the vertex areas as its row sums, so that the entries off the diagonal,
-    ``edge_mass``, say it all.
+    Row sums of U^T A U ``(n, n)`` are the vertex areas, so ``edge_mass`` has only the off-diagonal
+    entries.
     """
     if "edge_mass" not in mesh:
         return unit_area(mesh)
@@ -234,10 +244,9 @@ def unit_mass(mesh: xr.Dataset) -> Array | sp.csr_matrix:
 
 
 def reconstruct(mesh: xr.Dataset, f: Array, *, k: int | None = None) -> Array:
-    """A function on the mesh from its first k coefficients: Phi Phi^T A f.
+    """Reconstruct a function from its first k coefficients: Phi Phi^T A f.
 
-    On the samples of SCALABLE, whose eigenfunctions are coefficients in local functions, `f` is one
-    by its own: with as many eigenfunctions as samples it would come back as it is.
+    On samples of SCALABLE, `f` holds coefficients in the local functions, as the eigenfunctions do.
 
     Parameters
     ----------
@@ -246,7 +255,7 @@ def reconstruct(mesh: xr.Dataset, f: Array, *, k: int | None = None) -> Array:
     f : array_like (vertex, ...)
         One or several functions, for example the positions.
     k : int, optional
-        How many eigenfunctions; all by default.
+        Number of eigenfunctions; all by default.
 
     Returns
     -------
@@ -255,11 +264,16 @@ def reconstruct(mesh: xr.Dataset, f: Array, *, k: int | None = None) -> Array:
     Raises
     ------
     ValueError
-        When the mesh lacks its variables, or k is not a positive integer.
+        If the mesh lacks a variable, or k is not a positive integer.
+
+    See Also
+    --------
+    spectrum : Compute the eigenfunctions.
+    s4a.synthesize : Reconstruct a shape from principal component scores.
 
     Examples
     --------
-    The positions of a sphere are eigenfunctions, so that four of them are enough:
+    The positions of a sphere are eigenfunctions, so four of them are enough:
 
     >>> import s4a
     >>> ball = s4a.spectrum(s4a.coarsen(s4a.synthetic.sphere(2000), n_coarse=1000), k=4)
@@ -270,8 +284,8 @@ def reconstruct(mesh: xr.Dataset, f: Array, *, k: int | None = None) -> Array:
 
     >>> brain = s4a.synthetic.brains(1, 4000)["original/brain_01"].to_dataset()
     >>> few = s4a.spectrum(s4a.coarsen(brain, n_coarse=1500), k=100)
-    >>> built = {f"k = {k}": s4a.reconstruct(few, few["position"], k=k) for k in (10, 100)}
-    >>> pictures = {k: few.assign(position=(few["position"].dims, X)) for k, X in built.items()}
+    >>> smooth = {f"k = {k}": s4a.reconstruct(few, few["position"], k=k) for k in (10, 100)}
+    >>> pictures = {k: few.assign(position=(few["position"].dims, X)) for k, X in smooth.items()}
     >>> s4a.show.charts.surfaces(pictures)
     <TiledFigure ...>
     """
@@ -283,7 +297,7 @@ def reconstruct(mesh: xr.Dataset, f: Array, *, k: int | None = None) -> Array:
 
 
 def weyl(k: int) -> Array:
-    """Weyl's law for a closed surface of unit area: the i-th eigenvalue is about 4 pi i ``(k,)``.
+    """Eigenvalues of a closed surface of unit area by Weyl's law, about 4 pi i ``(k,)``.
 
     Examples
     --------

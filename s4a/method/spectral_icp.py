@@ -1,13 +1,13 @@
-"""Joint iterations: the smoothing of the displacement (4.2, eq. 8 and the line after it), iterated.
+"""Spectral ICP: iterated smoothing of the displacement (4.2, eq. 8 and the line after it).
 
-The target N carries the match, the source M is searched.  A round moves N onto M with a
-displacement that lives in the first K eigenfunctions of N, then asks for the nearest neighbours in
-position, normal and, with ``spectral > 0``, spectrum together; K grows as in ZoomOut.  The idea of
-coupling both is that of Smooth Shells (Eisenberger, Laehner, Cremers, CVPR 2020).  Where poses are
-far apart, every part of N turns on its own before.  All lengths are for surfaces of unit area.
+The match lives on the target N, the source M is searched.  An iteration moves N onto M with a
+displacement in the first K eigenfunctions of N, then finds nearest neighbours in position, normal
+and, with ``spectral > 0``, spectral coordinates together; K grows as in ZoomOut.  Smooth Shells
+(Eisenberger, Laehner, Cremers, CVPR 2020) couples both in this way.  If poses differ much, the
+displacement is piecewise rigid first.  All lengths are for surfaces of unit area.
 
-A *warp* (R, t, c) takes N to R x + t + Phi c, with one R (3, 3) and t (3,) for all of N, or one
-for each vertex of low resolution; R is a rotation, after elastic iterations any linear map.
+A *warp* (R, t, c) maps N to R x + t + Phi c, with one R (3, 3) and t (3,) for all of N, or one for
+each vertex of low resolution; R is a rotation, after elastic iterations any linear map.
 """
 
 from typing import NamedTuple
@@ -24,21 +24,21 @@ from s4a.method.shape import Basis, corresponding_landmarks
 from s4a.method.spectral import project
 from s4a.schema import Array
 
-FAR = 0.035  # between shapes of one pose the tenth that is farthest lies nearer, see `far_apart`
+POSE_DISTANCE = 0.035  # 90 % quantile of distances above which poses differ, see `poses_differ`
 
 Warp = tuple[Array, Array, Array]
 
 
 class Candidate(NamedTuple):
-    """A registration at low resolution, and its score without truth (lower is better)."""
+    """A registration at low resolution, and its score without ground truth (lower is better)."""
 
     score: float
     match: Array
     warp: Warp
 
 
-def turn(target: Basis, R: Array, t: Array) -> Array:
-    """R x + t for every vertex ``(n, 3)``, with one R and t for all, or one a low vertex."""
+def apply_transform(target: Basis, R: Array, t: Array) -> Array:
+    """Return R x + t for every vertex ``(n, 3)``, with one R and t, or one per low vertex."""
     if R.ndim == 2:
         return target.X @ R.T + t
     R = R.reshape(-1, 9)
@@ -49,21 +49,21 @@ def turn(target: Basis, R: Array, t: Array) -> Array:
 
 
 def move(target: Basis, warp: Warp) -> Array:
-    """The registered target R x + t + Phi c ``(n, 3)``."""
+    """Return the registered target R x + t + Phi c ``(n, 3)``."""
     R, t, c = warp
-    return turn(target, R, t) + target.field(c)
+    return apply_transform(target, R, t) + target.field(c)
 
 
 def nearest_vertices(source: Basis, moved: Basis) -> Array:
-    """The vertices ``(s,)`` of the source nearest in position and normal to the registered target.
+    """Nearest source vertices ``(s,)`` in position and normal to the registered target.
 
-    To its vertices near coarse ones, which at low resolution are all.
+    For its vertices near coarse ones, at low resolution for all.
     """
     return source.tree.query(features(moved.X, moved.normals)[moved.near_coarse])[1]
 
 
 def fit_warp(source: Basis, target: Basis, match: Array) -> Warp:
-    """The warp that brings the target's vertices near coarse ones onto their matches ``(s,)``."""
+    """Fit the warp of the target's vertices near coarse ones to their matches ``(s,)``."""
     rows = target.near_coarse
     return onto(target.X[rows], source.X[match], target.area[rows], target.coefficients)
 
@@ -71,10 +71,10 @@ def fit_warp(source: Basis, target: Basis, match: Array) -> Warp:
 def warp_after(
     source: Basis, target: Basis, match: Array, transform: RigidTransform, ratio: float
 ) -> Warp:
-    """The warp after a given transform instead of a fitted one: eq. 8 and the line after it.
+    """Fit the warp after a given transform: eq. 8 and the line after it.
 
-    The source moves by ``ratio R x + t``; what is left to its vertices, matched by the target's
-    vertices near coarse ones ``(s,)``, is smoothed.  The warp is that of the target, backwards.
+    The source moves by ``ratio R x + t``; the displacement to its vertices that match the target's
+    vertices near coarse ones ``(s,)`` is smoothed.  The warp is that of the target, the inverse.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def warp_after(
     transform : tuple (R, t)
         Rigid transform of the source onto the target, between their frames.
     ratio : float
-        Size of the source by that of the target; 1 where it is to be taken out.
+        Size of the source divided by that of the target; 1 to remove size.
     """
     R, t = transform
     moved = ratio * source.X[match] @ R.T + t
@@ -101,22 +101,21 @@ def coarse_spectral_icp(
     step: int = 5,
     iterations: int = 2,
     spectral: float = 0.0,
-    by_parts: bool = False,
+    articulated: bool = False,
 ) -> tuple[Array, Warp]:
-    """Joint iterations on low-resolution meshes, for K = k_first, k_first + step, ..., k.
+    """Spectral ICP on low-resolution meshes, for K = k_first, k_first + step, ..., k.
 
     Parameters
     ----------
     source, target : Basis
         At low resolution.
     match : int ndarray (n_target,)
-        Start, for example of ZoomOut.
+        Initialisation, for example by ZoomOut.
     spectral : float
-        The spectral coordinates weigh ``spectral / sqrt(K)``; 0 leaves 6 dimensions and a KD-tree.
-        0.1 for poses that are far apart.
-    by_parts : bool
-        Whether every vertex turns with its surroundings, :func:`s4a.method.deform.rigid_parts`, as
-        limbs do.
+        Spectral coordinates have the weight ``spectral / sqrt(K)``; with 0 a KD-tree of 6
+        dimensions is searched.
+    articulated : bool
+        Whether the warp is piecewise rigid, see :func:`s4a.method.deform.rigid_parts`.
 
     Returns
     -------
@@ -126,7 +125,7 @@ def coarse_spectral_icp(
     k = min(k, target.k, source.k)
     for K in [*range(min(k_first, k), k, step), k]:
         Phi = target.Phi[:, :K]
-        spectrum = (target.mass, Phi, target.eigenvalue[:K]) if by_parts else None
+        spectrum = (target.mass, Phi, target.eigenvalue[:K]) if articulated else None
 
         def coefficients(d, Phi=Phi):
             return project(Phi, target.mass, d)  # (K, 3)
@@ -149,14 +148,14 @@ def coarse_spectral_icp(
 def dense_spectral_icp(
     source: Basis, target: Basis, warp: Warp, *, iterations: int = 3
 ) -> tuple[Array, Warp]:
-    """Joint iterations at full resolution, on vertices near coarse ones; transforms of parts stay.
+    """Spectral ICP at full resolution, on vertices near coarse ones; R and t of parts are fixed.
 
     Parameters
     ----------
     source, target : Basis
         At full resolution.
     warp : tuple (R, t, c)
-        The end of the low iterations.
+        Result at low resolution.
 
     Returns
     -------
@@ -172,7 +171,9 @@ def dense_spectral_icp(
             warp = (
                 R,
                 t,
-                target.coefficients(source.X[match] - turn(target, R, t)[target.near_coarse]),
+                target.coefficients(
+                    source.X[match] - apply_transform(target, R, t)[target.near_coarse]
+                ),
             )
         match = nearest_vertices(source, target.moved_to(move(target, warp)))
     return match, warp
@@ -187,23 +188,22 @@ def registration_score(
     n_samples: int = 300,
     limit: float = 0.5,
 ) -> float:
-    """Score of a registration without truth, lower is better: round trip + gaps, both ways.
+    """Score a registration without ground truth: round trip plus distances; lower is better.
 
     The round trip goes from a vertex of the target to its match and back to the vertex whose
-    registered position (in position and normal) is nearest, measured along the edges of the target
-    and cut at `limit`; the gaps are the mean distances of the registered target and the source, at
-    the vertices near coarse ones of each; to them comes ``_landmark_distance``.  Lengths are for
-    unit area.
+    registered position and normal are nearest; its error is the path length along the edges of the
+    target, at most `limit`.  The distances are the mean distances between registered target and
+    source, in both directions, at the vertices near coarse ones, and ``_landmark_distance``.
+    Lengths are for unit area.
 
-    Stretch of edges is left out: on heads and brains with known warps it prefers maps that move
-    nothing.
+    Stretch is not in the score: on heads and brains with known warps it favours the identity.
 
     Parameters
     ----------
     source, target : Basis
         At one resolution.
     match : int ndarray (s,)
-        For the target's vertices near coarse ones.
+        Matches of the target's vertices near coarse ones.
     moved : Basis
         The registered target, see :meth:`s4a.method.shape.Basis.moved_to`.
     """
@@ -211,47 +211,49 @@ def registration_score(
     rows = np.arange(len(X))[target.near_coarse]
     back = X[tree.query(source.tree.data[source.near_coarse])[1]]
     back_distance = np.linalg.norm(source.X[source.near_coarse] - back, axis=1)
-    gap = np.linalg.norm(X[rows] - source.X[match], axis=1)
+    distance = np.linalg.norm(X[rows] - source.X[match], axis=1)
     n_samples = min(n_samples, len(match))
     sample = target.outwards[np.linspace(0, len(match) - 1, n_samples).astype(int)]
     end = tree.query(source.tree.data[match[sample]])[1]
     trip = path_lengths(target.graph, rows[sample], end, limit)
     return float(
-        trip.mean() + gap.mean() + back_distance.mean() + _landmark_distance(source, target, X)
+        trip.mean() + distance.mean() + back_distance.mean() + _landmark_distance(source, target, X)
     )
 
 
 def _landmark_distance(source, target, X):
-    """Mean distance of the landmarks that both have, the target's vertices at X; 0 without any."""
+    """Mean distance of common landmarks, with the target's vertices at X; 0 without landmarks."""
     at_source, at_target = corresponding_landmarks(source, target)
     if len(at_source) == 0:
         return 0.0
     return float(np.linalg.norm(X[at_target] - source.X[at_source], axis=1).mean())
 
 
-def far_apart(source: Basis, target: Basis, match: Array) -> bool:
-    """Whether poses differ: a tenth of the target lies far from its match after a rigid transform.
+def poses_differ(source: Basis, target: Basis, match: Array) -> bool:
+    """Return whether poses differ: the 90 % quantile of residuals after rigid alignment is large.
 
-    Far is 0.035 and 0.4 of the mean spacing 1 / sqrt(n) of the source's vertices, which alone keeps
-    matches apart: 0.04 for 6,000.  For nearest neighbours after ICP that tenth lies 0.005 to 0.031
-    away between faces, brains, heads or skulls, 0.025 to 0.046 between femurs or vertebrae, 0.044
-    to 0.23 between bodies, children or cats in other poses.
+    The threshold is 0.035 plus 0.4 of the mean vertex spacing 1 / sqrt(n) of the source, 0.04 for
+    6,000 vertices.  For nearest neighbours after ICP the quantile is 0.005 to 0.031 between faces,
+    brains, heads or skulls, 0.025 to 0.046 between femurs or vertebrae, 0.044 to 0.23 between
+    bodies, children or cats in different poses.
     """
     R, t, _ = rigid_transform(target.X, source.X[match], target.area)
-    gap = np.linalg.norm(turn(target, R, t) - source.X[match], axis=1)
-    return bool(np.quantile(gap, 0.9) > FAR + 0.4 / np.sqrt(len(source.X)))
+    residual = np.linalg.norm(apply_transform(target, R, t) - source.X[match], axis=1)
+    return bool(np.quantile(residual, 0.9) > POSE_DISTANCE + 0.4 / np.sqrt(len(source.X)))
 
 
-def as_given(source: Basis, target: Basis, starts: dict[str, Array]) -> dict[str, Candidate]:
-    """Registrations at low resolution: every start (n_target,) as it is, with its score."""
+def unrefined_candidates(
+    source: Basis, target: Basis, matches: dict[str, Array]
+) -> dict[str, Candidate]:
+    """Return each initial match (n_target,) as a candidate, without iterations."""
     return {
         name: scored(source, target, match, fit_warp(source, target, match))
-        for name, match in starts.items()
+        for name, match in matches.items()
     }
 
 
 def scored(source: Basis, target: Basis, match: Array, warp: Warp) -> Candidate:
-    """A registration with its score."""
+    """Return a match and its warp as a candidate with its score."""
     score = registration_score(source, target, match, target.moved_to(move(target, warp)))
     return Candidate(score, match, warp)
 
@@ -259,57 +261,58 @@ def scored(source: Basis, target: Basis, match: Array, warp: Warp) -> Candidate:
 def candidates(
     source: Basis,
     target: Basis,
-    starts: dict[str, Array],
+    matches: dict[str, Array],
     *,
     k: int = 100,
-    far: float = 0.03,
+    max_score: float = 0.03,
     articulated: bool = True,
 ) -> dict[str, Candidate]:
-    """Registrations at low resolution: every start as it is, and after joint iterations.
+    """Return candidates at low resolution: every initial match, before and after spectral ICP.
 
-    From the better start more iterations, with spectral coordinates, are tried: by parts where all
-    starts say that the poses are :func:`far_apart`, else in one piece where the best of these still
-    scores above `far`, as the shapes then differ much.
+    The better match also initialises iterations with spectral coordinates: piecewise rigid ones if
+    :func:`poses_differ` for all matches, else ordinary ones if all scores exceed `max_score`, as
+    the shapes then differ much.
 
     Parameters
     ----------
     source, target : Basis
         At low resolution.
-    starts : dict
+    matches : dict
         Name -> match (n_target,).
     articulated : bool
-        Whether to try iterations by parts.
+        Whether to try piecewise rigid iterations.
 
     Returns
     -------
     dict
-        ``"<start>"``, ``"<start>+joint"``, ``"<start>+joint+spectral"`` or ``"<start>+parts"`` ->
+        ``"<name>"``, ``"<name>+joint"``, ``"<name>+joint+spectral"`` or ``"<name>+parts"`` ->
         :class:`Candidate`.
     """
-    tried = as_given(source, target, starts)
+    results = unrefined_candidates(source, target, matches)
 
-    def enter(name, match, warp):
-        tried[name] = scored(source, target, match, warp)
+    def add(name, match, warp):
+        results[name] = scored(source, target, match, warp)
 
-    for name, match in starts.items():
-        enter(f"{name}+joint", *coarse_spectral_icp(source, target, match, k=k))
-    best = min(starts, key=lambda name: tried[f"{name}+joint"].score)
-    if articulated and all(far_apart(source, target, match) for match in starts.values()):
-        end = coarse_spectral_icp(
-            source, target, starts[best], k_first=20, k=k, iterations=1, spectral=0.2, by_parts=True
+    for name, match in matches.items():
+        add(f"{name}+joint", *coarse_spectral_icp(source, target, match, k=k))
+    best = min(matches, key=lambda name: results[f"{name}+joint"].score)
+    initial = source, target, matches[best]
+    if articulated and all(poses_differ(source, target, match) for match in matches.values()):
+        piecewise = coarse_spectral_icp(
+            *initial, k_first=20, k=k, iterations=1, spectral=0.2, articulated=True
         )
-        enter(f"{best}+parts", *end)
-    elif min(candidate.score for candidate in tried.values()) > far:
-        end = coarse_spectral_icp(source, target, starts[best], k=k, spectral=0.1)
-        enter(f"{best}+joint+spectral", *end)
-    return tried
+        add(f"{best}+parts", *piecewise)
+    elif min(candidate.score for candidate in results.values()) > max_score:
+        add(f"{best}+joint+spectral", *coarse_spectral_icp(*initial, k=k, spectral=0.1))
+    return results
 
 
-def finalists(tried: dict[str, Candidate], *, margin: float) -> list[str]:
-    """Names of the candidates whose score is within `margin` of the least, at most two, best first.
+def finalists(candidates: dict[str, Candidate], *, margin: float) -> list[str]:
+    """Return the names of at most two candidates with scores within `margin` of the best.
 
-    Scores at low resolution have the coarse sampling in them; near ones can only be told apart at
+    Low-resolution scores contain the error of coarse sampling; close ones can only be ranked at
     full resolution.
     """
-    order = sorted(tried, key=lambda name: tried[name].score)[:2]
-    return [name for name in order if tried[name].score <= margin * tried[order[0]].score]
+    scores = {name: candidate.score for name, candidate in candidates.items()}
+    order = sorted(scores, key=lambda name: scores[name])[:2]
+    return [name for name in order if scores[name] <= margin * scores[order[0]]]

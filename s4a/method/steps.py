@@ -1,7 +1,7 @@
-"""The steps of 4.1 and 4.2 one by one, on Datasets: from low-resolution meshes to a registration.
+"""The steps of 4.1 and 4.2 as functions of Datasets: from low-resolution meshes to a registration.
 
-:func:`s4a.analyse` runs them over a folder; here is what each takes and gives.  Before them come
-:func:`s4a.coarsen` and :func:`s4a.spectrum`, after them :func:`s4a.method.pca.pca`.
+:func:`s4a.analyse` runs them over a folder.  Before them come :func:`s4a.coarsen` and
+:func:`s4a.spectrum`, after them :func:`s4a.method.pca.pca`.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,16 +14,21 @@ from threadpoolctl import threadpool_limits
 from s4a.geometry.align import RigidTransform, align, realign, relative_transform
 from s4a.method import fmap, network
 from s4a.method.initial_map import initial_map, map_after_alignment, transform_onto
-from s4a.method.latent import DENSE_ITERATIONS, consistent_zoomout, nearest_spectra, place
+from s4a.method.latent import (
+    DENSE_ITERATIONS,
+    consistent_zoomout,
+    nearest_spectra,
+    out_of_sample_basis,
+)
 from s4a.method.median import median_shape
 from s4a.method.register import from_latent, identity, match_functions, match_low
 from s4a.method.shape import Basis, Shape
 from s4a.options import DECLARED, N_SAMPLES, check, kept_options
 from s4a.schema import check_count, check_type, dataset, require
 
-PROJECTION = [name for name, one in DECLARED.items() if one.metadata["of"] == "projection"]
+PROJECTION = [name for name, option in DECLARED.items() if option.metadata["of"] == "projection"]
 REGISTRATION = [
-    *(name for name, one in DECLARED.items() if one.metadata["of"] == "registration"),
+    *(name for name, option in DECLARED.items() if option.metadata["of"] == "registration"),
     "dense_match",
     *PROJECTION,
 ]
@@ -38,15 +43,15 @@ def check_coarse(coarse: dict[str, xr.Dataset]) -> None:
 
 
 def bases_of(coarse: dict[str, xr.Dataset]) -> dict[str, Basis]:
-    """The low-resolution meshes of a collection in their frames; ValueError where one is none."""
+    """Return the low-resolution meshes of a collection, each in its frame, after a check."""
     check_coarse(coarse)
     return {name: Shape(coarse=mesh).low for name, mesh in coarse.items()}
 
 
-class LowBases(Sequence[Basis]):
-    """The low-resolution meshes of a collection in their frames, each made when it is asked for.
+class LazyBases(Sequence[Basis]):
+    """Low-resolution meshes of a collection, each in its frame and made on access.
 
-    Of meshes in files no more are in memory than are used at a time.
+    Meshes in files are read on access, so memory holds only those in use.
     """
 
     def __init__(self, coarse: dict[str, xr.Dataset]):
@@ -60,25 +65,33 @@ class LowBases(Sequence[Basis]):
 
 
 def align_pair(source: xr.Dataset, target: xr.Dataset) -> xr.Dataset:
-    """Rigid transform of a shape onto another by iterative closest points (4.1, step 2).
+    """Align a shape rigidly to another by iterative closest points (4.1, step 2).
 
     Parameters
     ----------
     source, target : xarray.Dataset
-        Low-resolution meshes with their spectrum, as of :func:`s4a.coarsen` and
+        Low-resolution meshes with their spectrum, from :func:`s4a.coarsen` and
         :func:`s4a.spectrum`.
 
     Returns
     -------
     xarray.Dataset
-        ``rotation`` R and ``translation`` t of R x + t, between the frames of both: centred, the
-        square root of the area as unit.  The attribute ``residual`` is the trimmed root mean square
-        distance of the pairs, in the same unit.
+        ``rotation`` R and ``translation`` t of R x + t, between the frames of both shapes: centred,
+        with the square root of the area as unit.  The attribute ``residual`` is the trimmed root
+        mean square distance of the pairs, in the same unit.
 
     Raises
     ------
     ValueError
-        When a mesh lacks its variables.
+        If a mesh lacks a variable.
+
+    See Also
+    --------
+    build_network : Align all shapes of a collection and compute their initial maps.
+
+    References
+    ----------
+    Besl, P. J. and McKay, N. D. (1992). A method for registration of 3-D shapes. IEEE TPAMI 14.
 
     Examples
     --------
@@ -102,26 +115,27 @@ def map_pairs(
     initial_refinement: bool = True,
     n_samples: int = N_SAMPLES,
 ) -> xr.Dataset:
-    """Initial maps of some pairs, in both directions (4.1, steps 3 and 4).
+    """Compute the initial maps of some pairs, in both directions (4.1, steps 3 and 4).
 
     Parameters
     ----------
     bases : dict
         Name of a shape -> its low resolution.
     transforms : dict
-        Name -> transform (R, t) onto a common reference.
+        Name -> rigid transform (R, t) onto a common reference.
     pairs : sequence of (str, str)
     k_init, init : see :func:`s4a.analyse`
     initial_refinement : bool
-        Whether a step of ZoomOut is done ahead (4.2).
+        Whether to refine the maps by a step of ZoomOut (4.2).
     n_samples : int
-        Spread vertices on which that step looks for matches in near poses; 0 for all.
+        Farthest-point samples on which that step searches matches if poses are similar; 0 for all
+        vertices.
 
     Returns
     -------
     xarray.Dataset
-        ``source(pair)``, ``target(pair)`` and ``fmap_initial``; ``fmap_fitted``, the same before
-        the step ahead; ``pair_rotation``, ``pair_translation``, the transform of ICP; with
+        ``source(pair)``, ``target(pair)`` and ``fmap_initial``; ``fmap_fitted``, the maps before
+        the refinement; ``pair_rotation``, ``pair_translation``, the transform of ICP; with
         landmarks ``landmark_of_source(pair, landmark)`` and ``landmark_of_target``.
     """
     options: dict[str, Any] = {
@@ -133,22 +147,21 @@ def map_pairs(
     rows: list[tuple[Any, ...]] = []
     for a, b in pairs:
         M, N = bases[a], bases[b]
-        start = relative_transform(transforms[a], transforms[b])
-        R, t = realign(M.cloud, N.cloud, start)
+        R, t = realign(M.cloud, N.cloud, relative_transform(transforms[a], transforms[b]))
         R_back, t_back = R.T, -R.T @ t
-        first = initial_map(M, N, (R, t), **options)
+        forth = initial_map(M, N, (R, t), **options)
         back = map_after_alignment(N, M, (R_back, t_back), **options)
-        if first.name != init:  # far poses: the other direction must tell the same limbs apart
-            back = back._replace(C=fmap.refine_once(N, M, first.C.T), fitted=first.C.T)
-        rows.append((a, b, first.C, first.fitted, R, t, first.landmarks))
+        if forth.name != init:  # large pose difference: both directions must match the same limbs
+            back = back._replace(C=fmap.refine_once(N, M, forth.C.T), fitted=forth.C.T)
+        rows.append((a, b, forth.C, forth.fitted, R, t, forth.landmarks))
         rows.append((b, a, back.C, back.fitted, R_back, t_back, back.landmarks))
     names = ("source", "target", "fmap_initial", "fmap_fitted", "pair_rotation", "pair_translation")
     *columns, marks = map(np.array, zip(*rows, strict=True))
-    found = dataset(None, **dict(zip(names, columns, strict=True)))
+    maps = dataset(None, **dict(zip(names, columns, strict=True)))
     if init != "landmarks":
-        return found
+        return maps
     # marks (p, 2, landmarks)
-    return found.merge(dataset(landmark_of_source=marks[:, 0], landmark_of_target=marks[:, 1]))
+    return maps.merge(dataset(landmark_of_source=marks[:, 0], landmark_of_target=marks[:, 1]))
 
 
 def build_network(
@@ -160,7 +173,7 @@ def build_network(
     initial_refinement: bool = True,
     n_samples: int = N_SAMPLES,
 ) -> xr.Dataset:
-    """The network of initial maps of a collection (3.4, 4.1): its pairs, and a map each way.
+    """Build the network of initial maps of a collection (3.4, 4.1).
 
     Parameters
     ----------
@@ -171,15 +184,25 @@ def build_network(
     Returns
     -------
     xarray.Dataset
-        ``source(pair)``, ``target(pair)`` and ``fmap_initial(pair, eigenpair_target_initial,
-        eigenpair_source_initial)``; what else :func:`map_pairs` gives; ``icp_rotation(shape, xyz,
-        xyz_2)`` and ``icp_translation(shape, xyz)`` onto the shape that all are aligned to, the
-        attribute ``reference``.
+        ``source(pair)``, ``target(pair)``, ``fmap_initial(pair, eigenpair_target_initial,
+        eigenpair_source_initial)``, both directions of each pair, and the other variables of
+        :func:`map_pairs`; ``icp_rotation(shape, xyz, xyz_2)`` and ``icp_translation(shape, xyz)``
+        onto the shape in the attribute ``reference``.
 
     Raises
     ------
     ValueError
-        When a mesh lacks its variables, `init` is none, or the pairs cannot connect the shapes.
+        If a mesh lacks a variable, `init` is unknown, or the pairs cannot connect the shapes.
+
+    See Also
+    --------
+    refine_network : Refine the maps and compute the latent bases.
+    align_pair : Rigid alignment of one pair.
+
+    References
+    ----------
+    Ovsjanikov, M. et al. (2012). Functional maps: a flexible representation of maps between shapes.
+    ACM TOG 31(4).
 
     Examples
     --------
@@ -190,7 +213,7 @@ def build_network(
     >>> s4a.build_network(coarse, k_init=6)["fmap_initial"].shape
     (6, 6, 6)
 
-    The network of a study, an edge for each map, in the colour of its cycles' error:
+    The network of a study, with one edge per map, coloured by cycle error:
 
     >>> import numpy as np
     >>> study = s4a.synthetic.example_study()
@@ -199,8 +222,8 @@ def build_network(
     ...     np.array([names.index(name) for name in network[end].values])
     ...     for end in ("source", "target")
     ... )
-    >>> errors = {"first": network["cycle_error_initial"], "after": network["cycle_error"]}
-    >>> errors = {title: found.values for title, found in errors.items()}
+    >>> errors = {"initial": network["cycle_error_initial"], "refined": network["cycle_error"]}
+    >>> errors = {title: error.values for title, error in errors.items()}
     >>> charts = s4a.show.charts
     >>> charts.network(charts.on_circle(6), names, source, target, errors)
     <Figure ...>
@@ -230,15 +253,15 @@ def build_network(
 def with_transforms(
     maps: xr.Dataset, transforms: dict[str, RigidTransform], reference: str
 ) -> xr.Dataset:
-    """A network with the transforms of its shapes onto the `reference`."""
+    """Add the rigid transforms of the shapes onto the `reference` to a network."""
     R, t = (np.stack(values) for values in zip(*transforms.values(), strict=True))
-    placed = dataset(icp_rotation=R, icp_translation=t).assign_coords(shape=list(transforms))
-    return maps.merge(placed).assign_attrs(reference=reference)
+    alignment = dataset(icp_rotation=R, icp_translation=t).assign_coords(shape=list(transforms))
+    return maps.merge(alignment).assign_attrs(reference=reference)
 
 
 def refine_network(
     coarse: dict[str, xr.Dataset],
-    first: xr.Dataset,
+    initial: xr.Dataset,
     *,
     k: int = 100,
     step: int = 5,
@@ -251,35 +274,47 @@ def refine_network(
     n_jobs: int | None = 1,
     progress: Callable[..., Any] | None = None,
 ) -> xr.DataTree:
-    """Consistent ZoomOut of a network and the median shape (4.2; eq. 3 and 5).
+    """Refine a network by Consistent ZoomOut and find the median shape (4.2; eq. 3 and 5).
 
     Parameters
     ----------
     coarse : dict of str to xarray.Dataset
         Name -> low-resolution mesh with its spectrum.
-    first : xarray.Dataset
-        As of :func:`build_network`.
+    initial : xarray.Dataset
+        Network of :func:`build_network`.
     k, step, n_latent, weights, n_samples, dense_iterations, norm, keep_iterations : see
     :func:`s4a.analyse`
     n_jobs : int
         Threads; the result does not depend on it.
     progress : callable, optional
-        Called with the size of the maps after each round.
+        Called with the size of the maps after each iteration.
 
     Returns
     -------
     xarray.DataTree
         ``/network`` with ``fmap``, ``weight``, ``cycle_error`` and ``cycle_error_initial``;
-        ``/latent`` with ``latent_basis``, ``latent_eigenvalue`` and what
-        :func:`s4a.method.median.median_shape` adds, the attribute ``median`` among it; with
-        `keep_iterations` ``/iterations/k_020`` and so on, ``fmap``, ``latent_basis`` and
+        ``/latent`` with ``latent_basis``, ``latent_eigenvalue`` and the variables and attribute
+        ``median`` of :func:`s4a.method.median.median_shape`; with `keep_iterations`
+        ``/iterations/k_020`` and so on, with the ``fmap``, ``latent_basis`` and
         ``latent_eigenvalue`` of every size.
 
     Raises
     ------
     ValueError
-        When a mesh or the network lacks its variables, or an option is outside its range: k is at
-        least the size of the initial maps, and at most half of `n_samples` where that is not 0.
+        If a mesh or the network lacks a variable, or an option is out of range: k must be at least
+        the size of the initial maps, and at most half of `n_samples` unless that is 0.
+
+    See Also
+    --------
+    build_network : Compute the initial maps.
+    latent_map, latent_match : Maps and matches of any two shapes of the network.
+
+    References
+    ----------
+    Melzi, S. et al. (2019). ZoomOut: spectral upsampling for efficient shape correspondence. ACM
+    TOG 38(6).
+    Huang, R. et al. (2020). Consistent ZoomOut: efficient spectral map synchronization. Computer
+    Graphics Forum 39(5).
 
     Examples
     --------
@@ -293,8 +328,8 @@ def refine_network(
     >>> network, names = tree["network"].to_dataset(), list(coarse)
     >>> source, target = ([names.index(n) for n in network[end].values]
     ...                   for end in ("source", "target"))
-    >>> errors = {"first": network["cycle_error_initial"], "after": network["cycle_error"]}
-    >>> errors = {title: found.values for title, found in errors.items()}
+    >>> errors = {"initial": network["cycle_error_initial"], "refined": network["cycle_error"]}
+    >>> errors = {title: error.values for title, error in errors.items()}
     >>> s4a.show.charts.network(s4a.show.charts.on_circle(3), names, source, target, errors)
     <Figure ...>
     """
@@ -304,22 +339,24 @@ def refine_network(
     check("step", step)
     if n_latent is not None and n_latent > k:
         raise ValueError(f"n_latent must be at most k = {k}; found {n_latent}")
-    require(first, "source", "target", "fmap_initial", what="network")
+    require(initial, "source", "target", "fmap_initial", what="network")
     check_coarse(coarse)
-    bases, names = LowBases(coarse), list(coarse)
+    bases, names = LazyBases(coarse), list(coarse)
     k = min([k, *(mesh.sizes["eigenpair"] for mesh in coarse.values())])
-    source = np.array([names.index(name) for name in first["source"].values])
-    target = np.array([names.index(name) for name in first["target"].values])
-    C_initial = first["fmap_initial"].values  # (p, k_init, k_init)
+    source = np.array([names.index(name) for name in initial["source"].values])
+    target = np.array([names.index(name) for name in initial["target"].values])
+    C_initial = initial["fmap_initial"].values  # (p, k_init, k_init)
     if k < C_initial.shape[1]:
-        raise ValueError(f"k must be at least {C_initial.shape[1]}, as initial maps; found {k}")
+        raise ValueError(
+            f"k must be at least {C_initial.shape[1]}, the size of the initial maps; found {k}"
+        )
     iterations = {}
 
     def keep(C, Y, latent_eigenvalue):
-        found = dataset(
+        result = dataset(
             fmap=C.astype(np.float32), latent_basis=Y, latent_eigenvalue=latent_eigenvalue
         )
-        iterations[f"iterations/k_{len(Y[0]):03d}"] = found.assign_coords(shape=names)
+        iterations[f"iterations/k_{len(Y[0]):03d}"] = result.assign_coords(shape=names)
 
     with threadpool_limits(1):
         C, weight, _, Y, latent_eigenvalue = consistent_zoomout(
@@ -349,7 +386,7 @@ def refine_network(
     eigenvalues = np.stack([mesh["eigenvalue"].values[:k] for mesh in coarse.values()])  # (n, k)
     return xr.DataTree.from_dict(
         {
-            "network": first.merge(refined),
+            "network": initial.merge(refined),
             "latent": median_shape(latent, eigenvalues, norm=norm),
             **iterations,
         }
@@ -357,9 +394,9 @@ def refine_network(
 
 
 class Study:
-    """The nodes of a study as Datasets, ``study["coarse/brain_01"]``, from a tree.
+    """Nodes of a tree as Datasets: ``study["coarse/brain_01"]``.
 
-    What the steps take; :class:`s4a.study.tasks.Folder` gives the same of a folder, lazily.
+    :class:`s4a.study.tasks.Folder` is the same for a folder, and reads on access.
 
     Parameters
     ----------
@@ -372,17 +409,17 @@ class Study:
 
     def __contains__(self, node: str) -> bool:
         stage, _, name = node.partition("/")
-        found = self.tree.children.get(stage)
-        return found is not None and (not name or name in found.children)
+        node = self.tree.children.get(stage)
+        return node is not None and (not name or name in node.children)
 
     def __getitem__(self, node: str) -> xr.Dataset:
         return self.tree[node].to_dataset()
 
 
 def shape_in(study: Study, name: str, **projection: Any) -> Shape:
-    """A shape of a study at both resolutions; ValueError where the study has none of that name.
+    """Return a shape of a study at both resolutions.
 
-    Its fields are projected as `projection` says, see :class:`s4a.method.shape.Shape`.
+    `projection` are the options of :class:`s4a.method.shape.Shape`.
     """
     for stage in ("original", "coarse"):
         if f"{stage}/{name}" not in study:
@@ -391,86 +428,86 @@ def shape_in(study: Study, name: str, **projection: Any) -> Shape:
 
 
 def basis_in(study: Study, name: str) -> Basis:
-    """The coarse mesh of a shape, centred and for unit area, and its eigenfunctions."""
+    """Return the coarse mesh of a shape, centred and of unit area, with its eigenfunctions."""
     return Shape(coarse=study[f"coarse/{name}"]).low
 
 
 def options_of_registration(study: xr.DataTree) -> dict[str, Any]:
-    """The options that registrations of a study were made with, as far as its report names them."""
+    """Return the options of registration that the report of a study names."""
     check_type(study, xr.DataTree)
     return {name: v for name, v in kept_options(study).items() if name in REGISTRATION}
 
 
 def template_of(study: xr.DataTree) -> str:
-    """The template of a study: that of its registration, or the median shape."""
+    """Return the name of the template of a study; the median shape if nothing is registered yet."""
     if "registration" in study and "template" in study["registration"].attrs:
         return study["registration"].attrs["template"]
     return study["latent"].attrs["median"]
 
 
 def transform_in(study: Study, name: str) -> Any:
-    """Rigid transform (R, t) of a shape onto the reference of the network, or None.
+    """Return the rigid transform (R, t) of a shape onto the reference of the network, or None.
 
-    A shape apart from the network is moved there now, if that is not in the study.
+    A shape outside the network is aligned now if the study lacks its transform.
     """
     if f"network/alignment_{name}" in study:
-        own = study[f"network/alignment_{name}"]
-        return own["rotation"].values, own["translation"].values
+        alignment = study[f"network/alignment_{name}"]
+        return alignment["rotation"].values, alignment["translation"].values
     network = study["network"] if "network" in study else xr.Dataset()
     if "icp_rotation" not in network:
         return None
     if name in network["shape"]:
-        own = network.sel(shape=name)
-        return own["icp_rotation"].values, own["icp_translation"].values
+        alignment = network.sel(shape=name)
+        return alignment["icp_rotation"].values, alignment["icp_translation"].values
     return transform_onto(
         shape_in(study, name).low, shape_in(study, network.attrs["reference"]).low
     )
 
 
 def latent_bases(study: Study, *names: str) -> tuple[Any, ...]:
-    """The latent bases Y ``(k, m)`` of some shapes of a study.
+    """Return the latent bases Y ``(k, m)`` of some shapes of a study.
 
-    Those of the network are in ``/latent``, those of a shape apart in ``/latent/<shape>``.
+    Shapes of the network have them in ``/latent``, out-of-sample shapes in ``/latent/<shape>``.
     """
     latent, bases = study["latent"], []
     require(latent, "latent_basis", what="latent dataset")
     for name in names:
         if f"latent/{name}" in study:
             bases.append(study[f"latent/{name}"]["latent_basis"].values)
-        elif name in (known := latent["shape"].values.tolist()):
-            bases.append(latent["latent_basis"].values[known.index(name)])
+        elif name in (members := latent["shape"].values.tolist()):
+            bases.append(latent["latent_basis"].values[members.index(name)])
         else:
-            raise ValueError(f"no shape {name!r} in the network; it has {', '.join(known)}")
+            raise ValueError(f"no shape {name!r} in the network; it has {', '.join(members)}")
     return tuple(bases)
 
 
-def place_in(
+def out_of_sample_basis_in(
     study: Study,
     names: Sequence[str],
     basis: Basis,
     transforms: Callable[[str], RigidTransform],
     **options: Any,
 ) -> np.ndarray:
-    """The latent basis Y ``(k, m)`` of a shape beside a network that stays as it is (eq. 3).
+    """Compute the latent basis Y ``(k, m)`` of an out-of-sample shape (eq. 3).
 
     Parameters
     ----------
     study : Study
         With ``/latent`` and ``/coarse``.
     names : sequence of str
-        The shapes of the network, the first of them always taken.
+        Shapes of the network; the first is always used.
     basis : Basis
         Low resolution of the shape.
     transforms : callable
-        Gives the transform of the shape onto one of these.
+        Returns the rigid transform of the shape onto the shape of a given name.
     **options
-        Of :func:`s4a.method.latent.place`.
+        Options of :func:`s4a.method.latent.out_of_sample_basis`.
     """
     spectra = [study[f"coarse/{name}"]["eigenvalue"].values for name in names]
     near = [names[i] for i in nearest_spectra(basis.eigenvalue, spectra, options["k_init"])]
     bases = [basis_in(study, name) for name in near]
     Y = np.stack(latent_bases(study, *near))
-    return place(basis, bases, Y, [transforms(name) for name in near], **options)
+    return out_of_sample_basis(basis, bases, Y, [transforms(name) for name in near], **options)
 
 
 def register_in(
@@ -478,27 +515,31 @@ def register_in(
     name: str,
     template: str,
     target: Shape,
-    start: RigidTransform | None = None,
+    initial_transform: RigidTransform | None = None,
     **options: Any,
 ) -> xr.Dataset:
-    """:func:`register_shape` to the shape `target`, which is the template, with all options."""
+    """Register a shape to `target`, the shape of the template; see :func:`register_shape`."""
     if name == template:
         return identity(target)
-    projection = {one: getattr(target, one) for one in PROJECTION}
+    projection = {option: getattr(target, option) for option in PROJECTION}
     source = shape_in(study, name, **projection)
     bases = latent_bases(study, name, template)
     M, N = source.low, target.low
-    if start is None:
-        own, other = transform_in(study, name), transform_in(study, template)
-        start = relative_transform(own, other) if own and other else None
-    transform = transform_onto(M, N) if start is None else realign(M.cloud, N.cloud, start)
+    if initial_transform is None:
+        transforms = transform_in(study, name), transform_in(study, template)
+        initial_transform = relative_transform(*transforms) if all(transforms) else None
+    transform = (
+        transform_onto(M, N)
+        if initial_transform is None
+        else realign(M.cloud, N.cloud, initial_transform)
+    )
     return from_latent(source, target, bases, transform, **options)
 
 
 def latent_match(
     study: xr.DataTree, source: str, target: str, *, dense_match: str = "latent", full: bool = True
 ) -> xr.Dataset:
-    """Match of any two shapes of a network by their latent bases (eq. 3 and 6; eq. 7 or 4).
+    """Match any two shapes of a network by their latent bases (eq. 3 and 6; eq. 7 or 4).
 
     Parameters
     ----------
@@ -507,9 +548,9 @@ def latent_match(
     source, target : str
         Names of shapes.
     dense_match : {"latent", "fmap"}
-        At full resolution eq. 7, or eq. 4 with the functional map of the match of eq. 3.
+        Match at full resolution: eq. 7, or eq. 4 with the functional map of the match of eq. 3.
     full : bool
-        Whether original vertices are matched, or those of low resolution by eq. 3.
+        Whether to match original vertices, or those of low resolution by eq. 3.
 
     Returns
     -------
@@ -519,7 +560,12 @@ def latent_match(
     Raises
     ------
     ValueError
-        When a shape is not in the study, or `dense_match` is another word.
+        If a shape is not in the study, or `dense_match` is unknown.
+
+    See Also
+    --------
+    latent_map : Functional map of any two shapes.
+    register_shape : Registration to the template, which is more accurate.
 
     Examples
     --------
@@ -540,9 +586,9 @@ def latent_match(
 
 
 def latent_map(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
-    """Functional map of any two shapes of a network by their latent bases: C_ij = Y_j Y_i^+ (3.4).
+    """Compute the functional map of any two shapes of a network, C_ij = Y_j Y_i^+ (3.4).
 
-    It need not be a map of the network itself, and closes every cycle with others of its kind.
+    The pair need not be an edge of the network.  Latent maps are consistent along every cycle.
 
     Parameters
     ----------
@@ -559,7 +605,12 @@ def latent_map(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
     Raises
     ------
     ValueError
-        When a shape is not in the study.
+        If a shape is not in the study.
+
+    See Also
+    --------
+    latent_match : Match of any two shapes.
+    refine_network : Compute the latent bases.
 
     Examples
     --------
@@ -582,44 +633,54 @@ def register_shape(
     name: str,
     template: str | None = None,
     *,
-    start: RigidTransform | None = None,
+    initial_transform: RigidTransform | None = None,
     dense_match: str | None = None,
     **options: Any,
 ) -> xr.Dataset:
-    """One shape of a study registered to the template (4.2; eq. 6, 7 and 8).
-
-    By default as the study has it, with the options of its report.
+    """Register one shape of a study to the template (4.2; eq. 6, 7 and 8).
 
     Parameters
     ----------
     study : xarray.DataTree
-        With ``/original``, ``/coarse`` and ``/latent``; ``/network``, ``/registration`` and
-        ``/report``, as far as it has them, say what is the default of the others.
-    name, template : str
-        The template of the study by default; the median shape, where nothing is registered yet.
-    start : tuple (R, t), optional
-        About the rigid transform of the shape onto the template, between their frames; by default
-        that by which the network is aligned, or where there is none that of ICP from the principal
-        axes.
+        With ``/original``, ``/coarse`` and ``/latent``.  Defaults are taken from ``/network``,
+        ``/registration`` and ``/report`` if it has them.
+    name : str
+        Name of the shape.
+    template : str, optional
+        By default the template of the study, or the median shape if nothing is registered yet.
+    initial_transform : tuple (R, t), optional
+        Approximate rigid transform of the shape onto the template, between their frames.  By
+        default the alignment of the network; if there is none, ICP from the principal axes.
     dense_match : {"latent", "fmap"}, optional
         Eq. 7, or eq. 3 and 4.
     **options
         ``refine``, ``remove_size``, ``articulated`` and ``alignment`` of
         :func:`s4a.method.register.register`; ``n_projected`` and ``area_weighted`` of
-        :class:`s4a.method.shape.Shape`.  One that is not given, or as None, is that of the study's
-        report, as `dense_match` is; their own defaults hold where it names none.
+        :class:`s4a.method.shape.Shape`.  Options that are missing or None, `dense_match` too, are
+        those of the study's report, else the defaults of these functions.
 
     Returns
     -------
     xarray.Dataset
-        As of :func:`s4a.method.register.register`.
+        Registration of :func:`s4a.method.register.register`.
 
     Raises
     ------
     ValueError
-        When a shape is not in the study, or an option is none of its choices.
+        If a shape is not in the study, or an option has an unknown value.
     TypeError
-        When an option is another.
+        If an option is unknown.
+
+    See Also
+    --------
+    s4a.register_pairs : Register shapes to each other without a study.
+    s4a.insert : Register new shapes to the template of a study.
+    latent_match : The spectral match alone.
+
+    References
+    ----------
+    Amberg, B., Romdhani, S. and Vetter, T. (2007). Optimal step nonrigid ICP algorithms for surface
+    registration. CVPR.
 
     Examples
     --------
@@ -628,10 +689,10 @@ def register_shape(
     >>> s4a.register_shape(study, "brain_02")["displacement"].dims
     ('vertex', 'xyz')
     """
-    wrong = [option for option in options if option not in REGISTRATION]
-    if wrong:
+    unknown = [option for option in options if option not in REGISTRATION]
+    if unknown:
         raise TypeError(
-            f"unexpected options {', '.join(wrong)}; those of a registration are "
+            f"unexpected options {', '.join(unknown)}; those of a registration are "
             f"{', '.join(REGISTRATION)}"
         )
     given = {
@@ -640,10 +701,10 @@ def register_shape(
         if value is not None
     }
     options = options_of_registration(study) | given
-    for option in options.keys() & {"refine", "alignment", "how"}:
+    for option in options.keys() & {"refine", "alignment", "dense_match"}:
         check(option, options[option])
     projection = {key: options.pop(key) for key in PROJECTION if key in options}
     template = template_of(study) if template is None else template
     target = shape_in(Study(study), template, **projection)
     with threadpool_limits(1):
-        return register_in(Study(study), name, template, target, start, **options)
+        return register_in(Study(study), name, template, target, initial_transform, **options)

@@ -20,12 +20,12 @@ from s4a.input.landmarks import SUFFIXES
 from s4a.input.plausibility import find_warnings
 from s4a.input.subjects import listed
 from s4a.method.initial_map import transform_onto
-from s4a.method.latent import latent_of_new
+from s4a.method.latent import out_of_sample_latent
 from s4a.method.pca import project_scores
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape
-from s4a.method.steps import Study, latent_bases, place_in
+from s4a.method.steps import Study, latent_bases, out_of_sample_basis_in
 from s4a.options import Options, with_options
 from s4a.schema import check_type, dataset, in_unit, require, unit_of, variable
 from s4a.study.processes import workers
@@ -157,7 +157,7 @@ def insert(
     nodes = {f"original/{name}": meshes[name] for name in inserted}
     nodes[f"original/{template}"] = frozen.template.original
     nodes |= {f"coarse/{name}": one.coarse for name, one in inserted.items()}
-    nodes["latent"] = latent_of_new(
+    nodes["latent"] = out_of_sample_latent(
         np.stack([one.Y for one in inserted.values()]),
         np.stack([one.coarse["eigenvalue"].values for one in inserted.values()]),
         study["latent"].dataset["latent_eigenvalue"].values,
@@ -320,7 +320,7 @@ def _insert_one(mesh, frozen, options, references):
     shape = Shape(mesh, coarse, **options.of("projection"))
     R, t = transform_onto(shape.low, template.low)
     turn = study["registration"]["rotation"]  # onto the template
-    Y = place_in(
+    Y = out_of_sample_basis_in(
         study,
         names,
         Shape(coarse=coarse).low,
@@ -350,7 +350,7 @@ def descriptors_of(study: xr.DataTree) -> dict[str, xr.Dataset]:
     descriptors = {}
     known = known_to(study)
     by_size = sorted(known, key=lambda name: known[name]["area"])
-    for name in plausibility.spread(by_size, 2 * plausibility.N_REFERENCES):
+    for name in plausibility.evenly_chosen(by_size, 2 * plausibility.N_REFERENCES):
         mesh = study["original"][name].to_dataset()
         seen = plausibility.describe(mesh, intersections=False)
         if "report" in study:  # where they were counted
@@ -379,7 +379,7 @@ def report_beside(
             reports.append(shape_report({name: said}))
             continue
         flags, told = find_warnings(known | {name: said}, known_looks | {name: looks[name]})
-        reports.append(shape_report({name: said}, flags, evidence={name: looks[name]}))
+        reports.append(shape_report({name: said}, flags, comparisons={name: looks[name]}))
         remarks |= dict.fromkeys(line for line in told if line not in reported_before)
     return xr.concat(reports, dim="shape").assign_attrs(remarks="\n".join(remarks))
 

@@ -197,7 +197,8 @@ class Run:
         """The progress bar, at the beginning of a stage: one for all, which goes with the run."""
         stage = f"{stage}: ".ljust(LONGEST)
         if self.bar is None:
-            in_lines = log.isEnabledFor(logging.INFO)  # one for each stage
+            # a line of the log for each stage instead, or nothing where warnings are off
+            in_lines = log.isEnabledFor(logging.INFO) or not log.isEnabledFor(logging.WARNING)
             look = {"leave": False, "bar_format": "{desc}{percentage:3.0f}%|{bar}{r_bar}"}
             self.bar = tqdm(desc=stage, total=total, disable=in_lines, **look)
             if box := getattr(self.bar, "container", None):  # in a notebook

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
@@ -13,7 +12,7 @@ from s4a.input.annotations import files_beside
 from s4a.input.files import check_names, files_named, find_meshes
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import read_bytes, shown
-from s4a.input.subjects import listed
+from s4a.input.subjects import is_missing, listed
 from s4a.method.shape import features_of
 from s4a.schema import require
 from s4a.study.netcdf import read
@@ -170,7 +169,9 @@ def remarks_on_guides(sources: Sources, marked: Marked, features: Sequence[str] 
 
 def check_one_structure(subjects: xr.Dataset) -> None:
     """ValueError where a table says that shapes are several structures of one subject."""
-    if {"structure", "subject"} <= set(subjects) and len(np.unique(subjects["structure"])) > 1:
+    if not {"structure", "subject"} <= set(subjects):
+        return
+    if len({cell for cell in map(str, subjects["structure"].values) if not is_missing(cell)}) > 1:
         raise ValueError(
             f"{subjects.attrs['path']}: the column 'structure' names several, and one collection "
             f"has shapes of one kind; {SEVERAL}, or call the column otherwise"

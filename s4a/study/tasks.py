@@ -21,7 +21,7 @@ from s4a.input.collection import read_shape
 from s4a.input.landmarks import guides_of, with_landmarks
 from s4a.method import steps
 from s4a.method.initial_map import transform_onto
-from s4a.method.latent import latent_of_new
+from s4a.method.latent import out_of_sample_latent
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.shape import Shape, features_of
 from s4a.options import Options
@@ -188,7 +188,7 @@ def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
     latent, basis = read(folder / "latent.nc"), steps.basis_in(study, name)
     median, transform = latent.attrs["median"], steps.transform_in(study, name)
     names = [median, *(n for n in latent["shape"].values.tolist() if n != median)]
-    Y = steps.place_in(
+    Y = steps.out_of_sample_basis_in(
         study,
         names,
         basis,
@@ -199,7 +199,7 @@ def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
     )
     eigenvalues = study[f"coarse/{name}"]["eigenvalue"].values[None]
     latent_eigenvalue = latent["latent_eigenvalue"].values
-    found = latent_of_new(Y[None], eigenvalues, latent_eigenvalue, options.norm)
+    found = out_of_sample_latent(Y[None], eigenvalues, latent_eigenvalue, options.norm)
     return found.drop_vars("latent_eigenvalue").isel(shape=0)
 
 

@@ -83,8 +83,8 @@ def stack_registration(
     data = in_unit(data, units.pop() if len(units) == 1 else INPUT).assign_coords(shape=names)
     nodes = {"registration": data}
     for name in names:
-        way_back = files[name][["template_triangle", "template_barycentric"]]
-        nodes[f"registration/{name}"] = way_back.assign_attrs(files[name].attrs)
+        closest_on_template = files[name][["template_triangle", "template_barycentric"]]
+        nodes[f"registration/{name}"] = closest_on_template.assign_attrs(files[name].attrs)
     return nodes
 
 

@@ -530,4 +530,4 @@ def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path
     assert "--labels FILE" in capsys.readouterr().err
     points = ["--source-landmarks", str(tmp_path / "marks.csv"), "--blur", "1"]
     assert cli.main(["transfer", *map(str, files), *points, "--out", str(tmp_path / "no")]) == 2
-    assert "--blur is of labels" in capsys.readouterr().err
+    assert "--blur needs labels" in capsys.readouterr().err

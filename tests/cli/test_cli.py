@@ -64,6 +64,13 @@ def test_run_writes_a_line_for_each_stage_where_there_is_no_terminal(ran):
     assert "it/s" not in result.stderr
 
 
+def test_a_quiet_run_writes_no_stages_and_no_warnings(folder, tmp_path):
+    arguments = [sys.executable, "-m", "s4a", "run", str(folder), "-q", "-o", str(tmp_path / "s")]
+    result = subprocess.run([*arguments, *FLAGS], capture_output=True, text=True, check=False)
+    assert result.returncode == 0
+    assert result.stderr == ""
+
+
 def test_view_writes_a_page_into_the_study_or_where_it_is_told(ran, tmp_path, monkeypatch, capsys):
     study, _ = ran
     page = tmp_path / "page.html"
@@ -99,7 +106,7 @@ def test_check_lists_every_shape_that_fits_and_ends_with_1_where_one_is_excluded
         (["check", "nowhere"], "nowhere"),
         (["view", "nowhere"], "not a study folder"),
         (["run", "nowhere", "--out", "study"], "nowhere"),
-        (["statistics", "nowhere", "--covariates", "age"], "give --group or --variable"),
+        (["statistics", "nowhere", "--covariates", "age"], "give --group or --regress-on"),
         (
             ["run", "nowhere", "--out", "study", "--k", "3"],
             "s4a: --k must be an integer of at least 4; found 3",

@@ -10,7 +10,7 @@ import xarray as xr
 from s4a import Options, analyse, cli, insert, open_study, statistics, synthetic
 from s4a.input.annotations import read_labels, read_landmarks
 from s4a.input.files import slugs
-from s4a.input.subjects import read_table, with_table
+from s4a.input.subjects import read_table, subjects, with_table
 
 OPTIONS = {"n_coarse": 300, "k_init": 8, "k": 12, "n_jobs": 1}
 NAMES = [f"brain_{i:02d}" for i in range(1, 8)]
@@ -98,13 +98,31 @@ def test_a_person_of_several_shapes_is_named(tmp_path, caplog):
     assert "1 values of the column 'subject' stand for several shapes (p1: a, b)" in caplog.text
 
 
+def test_rows_without_a_shape_are_ignored_and_shapes_without_a_row_lack_values(tmp_path, caplog):
+    file = tmp_path / "table.csv"
+    file.write_text("shape,site,age\na,Bern,31\nc.ply,Basel,42\n")
+    found = read_table(file, ["a", "b"])
+    assert found["shape"].values.tolist() == ["a", "b"]
+    assert found["site"].values.tolist() == ["Bern", ""]
+    assert found["age"].values == pytest.approx([31, np.nan], nan_ok=True)
+    assert "rows ignored, as no shape has their name: c.ply" in caplog.text
+    assert "no row, so all values are missing: b" in caplog.text
+
+
+def test_statistics_leave_out_a_shape_that_has_no_row_in_the_table(caplog):
+    study = synthetic.example_study()
+    names = study["registration"]["shape"].values.tolist()
+    study["subjects"] = subjects({"age": np.arange(5) ** 2}, names[1:])
+    found = statistics.regression(study, "age", n_permutations=19)
+    assert found.attrs["left_out"] == names[0]
+    assert names[0] in caplog.text
+
+
 @pytest.mark.parametrize(
     "text, words",
     [
         ("name,age\na,1\n", "a column 'shape' .* needed; found \\['name', 'age'\\]"),
-        ("shape,age\na,1\n", "no row for b"),
-        ("shape,age\na,1\nb,2\nc.ply,3\n", "no shape is called 'c.ply'"),
-        ("shape,age\na,1\nA,2\n", "no shape is called 'A'; no row for b"),
+        ("shape,age\nc,1\nA,2\n", r"names of the shapes \(a, b\) needed .* found c, A"),
         ("shape,age\na,1\nb,2\na,3\n", "found two for 'a'"),
         ("shape,age\n# b is odd\n\na,1\nb\n", "2 cells in every row needed; line 5 has 1"),
         ("shape,a/b\na,1\nb,2\n", "without '/'; found 'a/b'"),
@@ -207,6 +225,7 @@ def test_a_table_can_take_the_place_of_the_first(folder):
         assert "sex" in study["subjects"]
 
 
+@pytest.mark.usefixtures("short_films")
 def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch):
     monkeypatch.setattr(
         "s4a.write_page",
@@ -217,7 +236,7 @@ def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch)
         str(folder / "study"),
         "--group",
         "sex",
-        "--variable",
+        "--regress-on",
         "age",
         "--permutations",
         "19",
@@ -255,7 +274,7 @@ def test_the_command_refuses_what_makes_no_test_and_says_a_warning_once(folder, 
     flags = ["--group", "sex", "--covariates", "score", "--permutations", "9"]
     assert cli.main([*command, *flags, "--variances", "unequal"]) == 0
     assert caplog.text.count("groups under 10 shapes (f: 3, m: 3)") == 1
-    assert "accounted for: covariate 'score'" in capsys.readouterr().out
+    assert "covariates: covariate 'score'" in capsys.readouterr().out
 
 
 def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):

@@ -99,7 +99,7 @@ def test_poses_are_far_apart_from_0_035_and_four_tenths_of_the_spacing_on(sphere
     gap = np.quantile(np.abs(stretched - sphere.X)[:, 2], 0.9)
     factor = share * (0.035 + 0.4 / np.sqrt(len(sphere.X))) / gap
     source = sphere.moved_to(sphere.X * [1, 1, 1 + factor])
-    assert spectral_icp.far_apart(source, sphere, np.arange(len(sphere.X))) == expected
+    assert spectral_icp.poses_differ(source, sphere, np.arange(len(sphere.X))) == expected
 
 
 def test_two_candidates_within_the_margin_are_finalists_the_better_one_first():
@@ -124,7 +124,7 @@ def surface():
 def ends(surface, X, **changed):
     """Where the vertices of a surface end on the same surface moved to X."""
     begin = np.eye(3), np.zeros(3), np.zeros((1, 3))
-    schedule = elastic.FOLLOWING._replace(**changed)
+    schedule = elastic.DEFORMATION._replace(**changed)
     return spectral_icp.move(
         surface, elastic.elastic_iterations(surface.moved_to(X), surface, begin, schedule)
     )

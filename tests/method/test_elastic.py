@@ -10,7 +10,13 @@ from s4a import analyse, match_pair, synthetic
 from s4a.geometry.closest import distance_to_surface
 from s4a.geometry.mesh import as_dataset, cotan_weights, stiffness, triangle_normals, vertex_normals
 from s4a.method import elastic, spectral_icp
-from s4a.method.register import TORN, elastic_surfaces, mends, register_surface, tear
+from s4a.method.register import (
+    MAX_STRAIN,
+    elastic_surfaces,
+    improves,
+    register_surface,
+    strain_quantile,
+)
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Basis
 from s4a.options import Options
@@ -145,7 +151,7 @@ def test_local_rounds_find_a_bump_that_no_function_of_the_basis_has(pair):
     source = replace(low, X=low.X + bump)
     d = elastic.local_iterations(source, low, template.diffusion, low.X)
     assert np.linalg.norm(d - bump, axis=1).max() < 0.4 * np.linalg.norm(bump, axis=1).max()
-    coarse = low.first(10)
+    coarse = low.truncated(10)
     left = bump - coarse.field(coarse.coefficients(bump))
     assert np.linalg.norm(d - bump, axis=1).mean() < 0.5 * np.linalg.norm(left, axis=1).mean()
 
@@ -227,7 +233,7 @@ def test_rounds_that_begin_less_stiff_are_nearer_where_the_template_is_torn(
         return found.attrs["initialisation"], torn, np.linalg.norm(image - true, axis=1).mean()
 
     method, torn, error = registered()
-    monkeypatch.setattr("s4a.method.register.TORN", np.inf)
+    monkeypatch.setattr("s4a.method.register.MAX_STRAIN", np.inf)
     stiff, torn_before, error_before = registered()
     assert method.endswith("+looser")
     assert stiff.endswith("+elastic")
@@ -244,11 +250,11 @@ def test_a_looser_end_is_kept_where_score_and_tear_fall_together(pair):
         return score, moved
 
     torn = end(1.0, 0.8)
-    assert tear(end(1.0, 0.0)[1], N) == pytest.approx(0, abs=1e-9)
-    assert tear(torn[1], N) > TORN
-    assert mends(end(0.97, 0.3), torn, N)  # on the right fold: a little nearer, hardly torn
-    assert not mends(end(0.91, 1.0), torn, N)  # it follows noise: nearer, and more torn
-    assert not mends(end(2.0, 0.5), torn, N)  # merely stiffer
+    assert strain_quantile(end(1.0, 0.0)[1], N) == pytest.approx(0, abs=1e-9)
+    assert strain_quantile(torn[1], N) > MAX_STRAIN
+    assert improves(end(0.97, 0.3), torn, N)  # on the right fold: a little nearer, hardly torn
+    assert not improves(end(0.91, 1.0), torn, N)  # it follows noise: nearer, and more torn
+    assert not improves(end(2.0, 0.5), torn, N)  # merely stiffer
 
 
 def test_a_coarse_triangle_without_area_is_no_obstacle(pair):
@@ -319,13 +325,13 @@ def test_boundaries_that_lie_on_each_other_end_on_each_other(monkeypatch):
 def test_a_shape_that_ends_elsewhere_keeps_its_boundary(monkeypatch):
     options = Options(n_coarse=800, k=40)
     template, shape = (shape_of(bowl(*how), options) for how in ((2000,), (2600, 0.2)))
-    assert elastic.boundary_ahead(shape.full, template.low, template.low.X) is None
+    assert elastic.boundary_attraction(shape.full, template.low, template.low.X) is None
     kept = rim_height(template, shape)
     monkeypatch.setattr(elastic, "BOUNDARY_WEIGHT", 0.0)
     assert kept == rim_height(template, shape)
     closed = shape_of(synthetic.ellipsoid(1000), options)
-    assert elastic.boundary_ahead(closed.full, template.low, template.low.X) is None
-    assert elastic.boundary_ahead(template.full, closed.low, closed.low.X) is None
+    assert elastic.boundary_attraction(closed.full, template.low, template.low.X) is None
+    assert elastic.boundary_attraction(template.full, closed.low, closed.low.X) is None
 
 
 @pytest.mark.parametrize("below", [-1e-11, -1e-7])
@@ -337,7 +343,10 @@ def test_a_direction_that_rounding_leaves_below_nothing_is_not_taken(below):
     right = axes @ np.array([1.0, 1.0, 1e-6, 1e-6])
     with pytest.raises(np.linalg.LinAlgError):
         scipy.linalg.solve(matrix, right, assume_a="pos")
-    along = axes.T @ elastic.step_of(matrix, right)
+    along = axes.T @ elastic.solve_normal_equations(matrix, right)
     assert along == pytest.approx([1, 2, 1, 0], abs=1e-4)
     sound = matrix + np.eye(4)
-    assert (elastic.step_of(sound, right) == scipy.linalg.solve(sound, right, assume_a="pos")).all()
+    assert (
+        elastic.solve_normal_equations(sound, right)
+        == scipy.linalg.solve(sound, right, assume_a="pos")
+    ).all()

@@ -104,7 +104,7 @@ def test_a_map_between_different_sizes_has_the_dims_target_by_source(shape):
 def test_the_landmark_fit_of_identical_shapes_is_near_the_identity(shape):
     Phi, area, eigenvalue, X = shape
     landmark = farthest_points(X, 10)
-    same = basis(Phi, area, eigenvalue).first(20)
+    same = basis(Phi, area, eigenvalue).truncated(20)
     C = fmap.fmap_from_landmarks(same, same, landmark, landmark)
     assert pytest.approx(np.eye(20), abs=1e-6) == C
 
@@ -114,8 +114,8 @@ def test_the_landmark_fit_finds_the_signs_of_the_eigenfunctions(shape, permuted)
     Psi, area_target, _, _, order, sign = permuted
     landmark = farthest_points(X, 10)
     same = np.argsort(order)[landmark]
-    source = basis(Phi, area, eigenvalue).first(20)
-    target = basis(Psi, area_target, eigenvalue).first(20)
+    source = basis(Phi, area, eigenvalue).truncated(20)
+    target = basis(Psi, area_target, eigenvalue).truncated(20)
     C = fmap.fmap_from_landmarks(source, target, landmark, same)
     assert pytest.approx(np.diag(sign[:20]), abs=1e-6) == C
 

@@ -56,7 +56,7 @@ def test_a_far_pose_is_matched_where_nearest_neighbours_begin_wrong(bent, monkey
     assert found.attrs["initialisation"] == "intrinsic+parts+local"
     assert found.attrs["initial_map"].split(",")[0] in ("hks", "wks", "hks+wks", "extremities 1")
     assert error(found, bent[0]) < 0.002
-    monkeypatch.setattr(spectral_icp, "far_apart", lambda *_: False)
+    monkeypatch.setattr(spectral_icp, "poses_differ", lambda *_: False)
     assert error(match_pair(*bent, n_coarse=1000, k=50), bent[0]) > 0.05
 
 
@@ -90,8 +90,8 @@ def test_the_parts_of_the_full_resolution_are_those_of_its_coarse_vertices(shape
         low.X, 2 * low.X[:, [1, 0, 2]] * [1, -1, 1], low.area, low.Phi, low.eigenvalue
     )
     at = shapes[0].coarse["sample_vertex"].values
-    assert spectral_icp.turn(full, R, t)[at] == pytest.approx(
-        spectral_icp.turn(low, R, t), abs=1e-6
+    assert spectral_icp.apply_transform(full, R, t)[at] == pytest.approx(
+        spectral_icp.apply_transform(low, R, t), abs=1e-6
     )
 
 
@@ -108,8 +108,8 @@ def test_shapes_in_one_pose_pay_nothing_and_keep_their_first_map(monkeypatch):
 
 def test_poses_are_far_apart_only_where_no_rigid_motion_brings_the_shapes_together(shapes):
     M, N = (s.low for s in shapes)
-    assert not spectral_icp.far_apart(M, M, np.arange(len(M.X)))
-    assert spectral_icp.far_apart(M, N, cKDTree(M.X).query(N.X)[1])
+    assert not spectral_icp.poses_differ(M, M, np.arange(len(M.X)))
+    assert spectral_icp.poses_differ(M, N, cKDTree(M.X).query(N.X)[1])
 
 
 def test_of_first_maps_the_one_that_fits_is_taken(shapes):

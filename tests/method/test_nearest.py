@@ -13,7 +13,7 @@ from s4a.method.nearest import (
     as_queries,
     into_cells,
     nearest_around,
-    nearest_both_ways,
+    nearest_bidirectional,
     nearest_float32,
     nearest_in_cells,
     nearest_of_few,
@@ -47,22 +47,22 @@ def clustered(n, d, seed, spread=0.05):
 
 
 @pytest.mark.parametrize("d", [1, 6, 50])
-@pytest.mark.parametrize("first", [1, 12, 1000])
-def test_the_answer_is_that_of_an_exhaustive_search_on_random_rows_in_random_cells(d, first):
+@pytest.mark.parametrize("n_initial", [1, 12, 1000])
+def test_the_answer_is_that_of_an_exhaustive_search_on_random_rows_in_random_cells(d, n_initial):
     rng = np.random.default_rng(d)
     Q, D = rng.normal(size=(1500, d)), rng.normal(size=(1200, d))
     found, *_ = nearest_in_cells(
-        Q, rng.integers(0, 37, 1500), D, rng.integers(0, 29, 1200), first=first
+        Q, rng.integers(0, 37, 1500), D, rng.integers(0, 29, 1200), n_initial=n_initial
     )
     assert check(Q, D, found) > (0.99 if d > 1 else 0.9)
 
 
-@pytest.mark.parametrize("first", [1, 12])
-def test_the_answer_is_that_of_an_exhaustive_search_on_clusters_with_few_comparisons(first):
+@pytest.mark.parametrize("n_initial", [1, 12])
+def test_the_answer_is_that_of_an_exhaustive_search_on_clusters_with_few_comparisons(n_initial):
     (Q, cell_q), (D, cell_d) = clustered(3000, 20, 1), clustered(2500, 20, 2)
-    found, share, _ = nearest_in_cells(Q, cell_q, D, cell_d, first=first)
+    found, share, _ = nearest_in_cells(Q, cell_q, D, cell_d, n_initial=n_initial)
     assert check(Q, D, found) > 0.999
-    assert share < (0.1 if first == 1 else 0.5)
+    assert share < (0.1 if n_initial == 1 else 0.5)
 
 
 def test_rows_far_from_the_origin_lose_nothing():
@@ -78,7 +78,7 @@ def test_rows_that_are_nearly_the_same_are_found_across_cells():
     order = rng.permutation(2000)
     Q = D[order] + 1e-4 * rng.normal(size=D.shape)
     found, *_ = nearest_in_cells(
-        Q, rng.integers(0, 50, 2000), D, rng.integers(0, 50, 2000), first=1
+        Q, rng.integers(0, 50, 2000), D, rng.integers(0, 50, 2000), n_initial=1
     )
     assert (found == order).all()
 
@@ -98,9 +98,9 @@ def test_queries_far_from_all_other_cells_are_certified_and_those_between_two_ar
     rng = np.random.default_rng(2)
     cell = np.repeat(np.arange(10), 50)
     D = 100.0 * np.eye(10)[cell] + rng.normal(size=(500, 10))
-    assert nearest_in_cells(D, cell, D, cell, first=1)[2] == 1
+    assert nearest_in_cells(D, cell, D, cell, n_initial=1)[2] == 1
     between = 50.0 * (np.eye(10)[0] + np.eye(10)[1]) + rng.normal(size=(30, 10))
-    found, _, certified = nearest_in_cells(between, np.zeros(30, int), D, cell, first=1)
+    found, _, certified = nearest_in_cells(between, np.zeros(30, int), D, cell, n_initial=1)
     assert certified < 0.5
     assert check(between, D, found) == 1
 
@@ -176,7 +176,7 @@ def test_a_search_around_what_is_found_among_some_gives_nearly_what_is_nearest_o
 def test_one_product_gives_the_nearest_both_ways(n, m):
     rng = np.random.default_rng(n)
     A, B = rng.normal(size=(n, 20)) + 3, rng.normal(size=(m, 20)) * [[1], [4]][n % 2] + 3
-    of_a, of_b = nearest_both_ways(as_queries(A), as_candidates(B))
+    of_a, of_b = nearest_bidirectional(as_queries(A), as_candidates(B))
     gap = np.linalg.norm(A[:, None] - B, axis=2)
     assert np.array_equal(of_a, gap.argmin(1))
     assert np.array_equal(of_b, gap.argmin(0))
@@ -184,7 +184,7 @@ def test_one_product_gives_the_nearest_both_ways(n, m):
 
 def test_both_ways_take_the_first_of_rows_that_are_equally_near():
     A = np.random.default_rng(5).integers(0, 3, (400, 3)).astype(float)
-    of_a, of_b = nearest_both_ways(as_queries(A), as_candidates(A))
-    first = (A[:, None] == A).all(2).argmax(1)
-    assert np.array_equal(of_a, first)
-    assert np.array_equal(of_b, first)
+    of_a, of_b = nearest_bidirectional(as_queries(A), as_candidates(A))
+    n_initial = (A[:, None] == A).all(2).argmax(1)
+    assert np.array_equal(of_a, n_initial)
+    assert np.array_equal(of_b, n_initial)

@@ -112,7 +112,7 @@ def test_a_budget_that_cannot_connect_is_refused_with_the_range(budget):
 
 
 def test_one_shape_is_no_network():
-    with pytest.raises(ValueError, match="at least 2 shapes, found 1"):
+    with pytest.raises(ValueError, match="at least 2 shapes; found 1"):
         network.choose_pairs(np.zeros((1, 1)), 1)
 
 

@@ -100,7 +100,7 @@ def test_scores_of_the_first_components_are_enough(simulated, modes):
 
 def test_too_many_scores_are_refused(simulated, modes):
     with pytest.raises(
-        ValueError, match=f"at most {modes.sizes['component']} numbers, found shape"
+        ValueError, match=f"at most {modes.sizes['component']} numbers; found shape"
     ):
         synthesize(study_of(simulated[0], modes), np.zeros(modes.sizes["component"] + 1))
 
@@ -151,7 +151,7 @@ def test_low_vertices_are_those_that_u_weighs_most():
 
 
 def test_two_shapes_are_refused_with_the_reason(simulated):
-    with pytest.raises(ValueError, match="at least 3 shapes, found 2"):
+    with pytest.raises(ValueError, match="at least 3 shapes; found 2"):
         pca.pca(simulated[0].isel(shape=[0, 1]), simulated[1])
 
 

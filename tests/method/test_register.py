@@ -153,7 +153,7 @@ def test_the_way_back_reproduces_the_positions(shapes):
     source, target = shapes
     image = source.original["position"].values  # the template deformed exactly
     moved = target.full.moved_to(source.to_frame(image))
-    triangle, weight = register.way_back(source.full, moved)
+    triangle, weight = register.closest_on_template(source.full, moved)
     assert weight.sum(1) == pytest.approx(1)
     assert weight.min() >= 0
     found = np.einsum("nc,ncx->nx", weight, image[target.full.T[triangle]])

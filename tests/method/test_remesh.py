@@ -304,7 +304,7 @@ def test_degenerate_coarse_triangles_go_through_the_robust_laplacian():
 @pytest.mark.parametrize(
     "X, T, options, message",
     [
-        (np.eye(3), [[0, 1, 3]], {}, "existing vertices"),
+        (np.eye(3), [[0, 1, 3]], {}, "valid indices"),
         (np.full((3, 3), np.nan), [[0, 1, 2]], {}, "finite"),
         (np.eye(4, 3), [[0, 1, 2]], {}, "1 vertices without triangle"),
         (

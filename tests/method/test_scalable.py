@@ -7,7 +7,7 @@ from s4a import synthetic
 from s4a.geometry.mesh import edge_graph, edges, path_lengths
 from s4a.method import fmap
 from s4a.method.nearest import nearest_in_cells
-from s4a.method.scalable import local_functions, local_space, reduce, spread
+from s4a.method.scalable import covering_samples, local_functions, local_space, reduce
 from s4a.method.shape import Shape
 
 
@@ -45,7 +45,7 @@ def test_local_functions_sum_to_one_and_reach_as_far_as_the_radius_along_the_sur
     torus = synthetic.torus(60, 30)
     sample, _, U = local_space(torus, 150)
     X, T = unit_arrays(torus)
-    _, _, radius, G = spread(X, T, 150)
+    _, _, radius, G = covering_samples(X, T, 150)
     np.testing.assert_allclose(U.sum(axis=1), 1)
     i, j = U.nonzero()
     assert (path_lengths(G, sample[j], i, 9.0) < radius).all()
@@ -56,7 +56,7 @@ def test_local_functions_do_not_cross_a_thin_wall():
     outer, inner = synthetic.sphere(3000), synthetic.sphere(3000, radius=0.98)
     X = np.concatenate([m["position"].values for m in (outer, inner)])
     T = np.concatenate([outer["corner_vertex"].values, inner["corner_vertex"].values + 3000])
-    sample, _, radius, _ = spread(X, T, 600)
+    sample, _, radius, _ = covering_samples(X, T, 600)
     U = local_functions(X, edge_graph(X, edges(T)), sample, radius)
     i, j = U.nonzero()
     assert ((i < 3000) == (sample[j] < 3000)).all()
@@ -66,7 +66,7 @@ def test_every_vertex_is_well_inside_a_bump_on_a_surface_of_uneven_sampling():
     mesh = synthetic.ellipsoid(3000, (6.0, 1.0, 0.3))
     sample, cell, _ = local_space(mesh, 200)
     X, T = unit_arrays(mesh)
-    _, _, radius, G = spread(X, T, 200)
+    _, _, radius, G = covering_samples(X, T, 200)
     assert path_lengths(G, sample[cell], np.arange(3000), 9.0).max() <= 0.75 * radius
 
 

@@ -181,7 +181,7 @@ def test_a_spectrum_asked_for_again_replaces_the_one_before():
 
 def test_samples_of_scalable_keep_the_spectrum_that_they_come_with():
     low = low_resolution(synthetic.sphere(200), method="scalable", n_coarse=100, k=5)
-    with pytest.raises(ValueError, match="samples of SCALABLE come with their spectrum"):
+    with pytest.raises(ValueError, match="samples of SCALABLE have a spectrum"):
         spectrum(low, k=6)
 
 

@@ -121,9 +121,9 @@ def test_a_latent_space_as_large_as_maps_that_are_reduced_is_reduced_with_them()
     [
         ({"step": 0}, "step must be an integer of at least 1; found 0"),
         ({"step": -1}, "step must be an integer of at least 1; found -1"),
-        ({"k": 6}, "k must be at least 10, as initial maps; found 6"),
+        ({"k": 6}, "k must be at least 10, the size of the initial maps; found 6"),
         ({"k": 12, "n_latent": 13}, "n_latent must be at most k = 12; found 13"),
-        ({"n_samples": 47}, "need 48 spread vertices or more; found 47: give n_samples=48"),
+        ({"n_samples": 47}, "need at least 48 samples; found 47: give n_samples=48"),
     ],
 )
 def test_sizes_that_do_not_fit_each_other_are_refused_by_name(study, coarse, options, message):
@@ -180,5 +180,5 @@ def test_what_lacks_is_named(study, coarse):
         s4a.build_network({"a": coarse["brain_01"].drop_vars("eigenvalue")})
     with pytest.raises(ValueError, match="/original/nobody is needed; this one has none"):
         s4a.latent_match(study, "nobody", "brain_01")
-    with pytest.raises(ValueError, match="how must be"):
+    with pytest.raises(ValueError, match="dense_match must be"):
         s4a.latent_match(study, "brain_01", "brain_02", dense_match="both")

@@ -64,6 +64,16 @@ def test_every_recipe_is_a_question_and_runs_in_at_most_fifteen_lines(page, tmp_
         exec(code, names)
 
 
+def test_the_tutorial_finds_the_simulated_group_difference(tmp_path, monkeypatch):
+    matplotlib.use("agg")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for code in cells("tutorial.md"):
+        exec(code, names)
+    assert names["test"]["p_value"] < 0.01
+    assert names["significant"].mean() > 0.2
+
+
 def test_the_quickstart_of_readme_prints_what_it_shows(tmp_path, monkeypatch, capsys):
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     code, printed = re.search(

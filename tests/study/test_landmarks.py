@@ -221,7 +221,7 @@ def test_landmarks_of_a_mirrored_shape_lie_where_they_lay(marked):
 def test_landmarks_without_elastic_rounds_are_refused(marked):
     meshes, folder = marked
     with pytest.raises(
-        ValueError, match="landmarks pull elastic iterations, and refine='spectral_icp'"
+        ValueError, match="landmarks guide elastic iterations, and refine='spectral_icp'"
     ):
         analyse(meshes, landmarks=folder, refine="spectral_icp")
 

@@ -280,10 +280,10 @@ def test_bad_shapes_are_left_out_and_reported(brain_files, tmp_path):
 def test_two_shapes_have_no_modes_and_the_study_says_why(arrays):
     tree = analyse(dict(list(arrays.items())[:2]), **OPTIONS)
     assert "pca" not in tree
-    assert tree["report"].attrs["no_modes"] == "PCA needs at least 3 shapes, found 2"
+    assert tree["report"].attrs["no_modes"] == "PCA needs at least 3 shapes; found 2"
     assert tree["registration"].sizes["shape"] == 2
     with pytest.raises(
-        ValueError, match="a study with modes is needed; this one has none: PCA needs at least 3"
+        ValueError, match="a study with /pca is needed; this one has none: PCA needs at least 3"
     ):
         synthesize(tree, [1.0])
 
@@ -300,12 +300,12 @@ def test_shapes_that_differ_in_pose_alone_do_not_differ(arrays):
 @pytest.mark.parametrize(
     "given, no_modes",
     [
-        ("aa", "PCA needs at least 3 shapes, found 2"),
+        ("aa", "PCA needs at least 3 shapes; found 2"),
         ("aaa", "PCA needs shapes that differ; all displacements are equal"),
         (
             "aab",
-            "PCA needs at least 3 shapes, found 2; 1 flagged shapes are left out, "
-            "include_flagged=True takes them in",
+            "PCA needs at least 3 shapes; found 2; 1 flagged shapes are excluded: "
+            "include_flagged=True includes them",
         ),
     ],
 )

@@ -145,6 +145,6 @@ def test_the_command_of_new_shapes_mirrors_them_too(newcomer, folder, tmp_path, 
     s4a.write_mesh(tmp_path / "s9.ply", *newcomer[1])
     command = ["insert", str(folder), str(tmp_path / "s9.ply"), "--out", str(tmp_path / "out")]
     assert cli.main([*command, "--reflect", "auto", "--n-jobs", "1"]) == 0
-    assert "left for right" not in capsys.readouterr().out
+    assert "mirror image" not in capsys.readouterr().out
     assert cli.main([*command, "--reflect", "s1", "--n-jobs", "1"]) == 2
     assert "reflect names 's1', none of the new shapes (s9)" in capsys.readouterr().err

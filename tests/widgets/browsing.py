@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import time
 
 import numpy as np
 import pytest
@@ -96,6 +97,7 @@ def run_notebook(page, lab, name):
 def open_tab(page, title):
     page.locator(".jupyter-widgets .lm-TabBar-tabLabel", has_text=title).first.click()
     page.wait_for_function(DRAWN)
+    lay_out(page)
 
 
 def visible(page, selector):
@@ -104,6 +106,43 @@ def visible(page, selector):
 
 def pixels(canvas):
     return canvas.evaluate("(c) => { c.view.draw(); return c.toDataURL(); }")
+
+
+def lay_out(page):
+    """Let two frames pass, in which charts follow the width."""
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def settled(page, check, act=lambda: None, seconds=30):
+    """What a check gives once it holds; an action that a busy browser may lose is repeated.
+
+    A check that is False or raises an AssertionError is asked again.
+    """
+    end = time.monotonic() + seconds
+    while True:
+        act()
+        for _ in range(10):
+            late = time.monotonic() > end
+            try:
+                if (found := check()) is None or found:
+                    return found
+                assert not late, "it never holds"
+            except AssertionError:
+                if late:
+                    raise
+            page.wait_for_timeout(50)
+
+
+def redrawn(canvas, before):
+    """The pixels of a view that are no longer those of before, and stay as they are."""
+    seen = [before]
+
+    def rests():
+        seen.append(pixels(canvas))
+        return seen[-1] == seen[-2] != before
+
+    settled(canvas.page, rests)
+    return seen[-1]
 
 
 def vertices(canvas):
@@ -190,6 +229,11 @@ def notebooks(folder, **cells):
 
 def check_read(panel, least, width=None):
     """The smallest text of a panel has at least so many pixels, and nothing is cut off."""
+    lay_out(panel.page)
+    settled(panel.page, lambda: assert_read(panel, least, width))
+
+
+def assert_read(panel, least, width):
     smallest, text = panel.evaluate(SMALLEST)
     assert smallest >= least, text
     if width is None:

@@ -27,6 +27,7 @@ from browsing import (
     contrasts,
     cursor,
     faint,
+    lay_out,
     move,
     needed,
     notebooks,
@@ -34,6 +35,7 @@ from browsing import (
     pixels,
     run_notebook,
     serious,
+    settled,
     vertices,
     visible,
     watched,
@@ -41,6 +43,7 @@ from browsing import (
 from paths import NOTEBOOKS
 
 import s4a
+from s4a.show import panel_page
 from s4a.show.draw import vertices_within
 from s4a.show.surfaces import aligned
 from s4a_morphometrics.region_panel import Region
@@ -331,15 +334,18 @@ def test_the_other_tabs_draw(page, title):
 
 def test_nothing_is_cut_off_at_800_pixels(page):
     page.set_viewport_size({"width": 800, "height": 1300})
-    for title in ("Network", "Modes"):
-        open_tab(page, title)
-        page.wait_for_timeout(300)
+
+    def uncut():
         for label in page.locator(".s4a-tabs .lm-TabBar-tabLabel").all():
             assert label.evaluate("(e) => e.scrollWidth <= e.clientWidth + 1"), label.inner_text()
         assert visible(page, ".s4a").count() > 0
         for part in visible(page, ".s4a").all():
             assert part.evaluate("(e) => e.scrollWidth <= e.clientWidth + 2")
             assert part.bounding_box()["x"] + part.bounding_box()["width"] <= 800
+
+    for title in ("Network", "Modes"):
+        open_tab(page, title)
+        settled(page, uncut)
 
 
 def test_nothing_scrolls_sideways_and_charts_are_seen_at_once_beside_the_files(page):
@@ -351,17 +357,19 @@ def test_nothing_scrolls_sideways_and_charts_are_seen_at_once_beside_the_files(p
     assert page.locator(".jp-FileBrowser").is_visible()
     for title in reversed(TITLES):
         open_tab(page, title)
-        page.wait_for_timeout(300)
-        assert page.evaluate(wide) == [], title
-    page.locator(".s4a-tabs").evaluate("(e) => e.scrollIntoView()")
-    page.wait_for_timeout(300)
-    window = page.locator(".jp-WindowedPanel-outer").bounding_box()
-    for part in (VIEW, ".s4a-slider", "svg.s4a-chart"):
-        assert visible(page, part).count() > 0
-        for one in visible(page, part).all():
-            box = one.bounding_box()
-            assert window["y"] <= box["y"]
-            assert box["y"] + box["height"] <= window["y"] + window["height"], part
+        settled(page, lambda: page.evaluate(wide) == [])
+
+    def seen_at_once():
+        page.locator(".s4a-tabs").evaluate("(e) => e.scrollIntoView()")
+        window = page.locator(".jp-WindowedPanel-outer").bounding_box()
+        for part in (VIEW, ".s4a-slider", "svg.s4a-chart"):
+            assert visible(page, part).count() > 0
+            for one in visible(page, part).all():
+                box = one.bounding_box()
+                assert window["y"] <= box["y"]
+                assert box["y"] + box["height"] <= window["y"] + window["height"], part
+
+    settled(page, seen_at_once)
 
 
 # ---- any width
@@ -385,7 +393,7 @@ def tabs_of(page, i, title="Modes"):
     tabs.locator(".lm-TabBar-tabLabel", has_text=title).click()
     tabs.locator(f".s4a-panel >> visible=true >> {VIEW} >> visible=true").first.wait_for()
     page.wait_for_function(DRAWN)
-    page.wait_for_timeout(200)  # charts follow the width
+    lay_out(page)
     return tabs
 
 
@@ -443,11 +451,15 @@ def test_graph_matrix_and_both_surfaces_are_seen_at_once(sizes, title):
     if title == "Network":
         panel.locator(".s4a-edge").nth(6).dispatch_event("click")
         panel.locator(".s4a-title", has_text="the target").wait_for()
-    assert panel.locator(VIEW).filter(visible=True).count() == 2
-    assert panel.locator(".s4a-matrix").is_visible()
-    box = panel.bounding_box()
-    assert box["width"] <= 1366
-    assert box["height"] <= 680
+
+    def seen_at_once():
+        assert panel.locator(VIEW).filter(visible=True).count() == 2
+        assert panel.locator(".s4a-matrix").is_visible()
+        box = panel.bounding_box()
+        assert box["width"] <= 1366
+        assert box["height"] <= 680
+
+    settled(sizes, seen_at_once)
     sizes.set_viewport_size({"width": 1920, "height": 1080})
 
 
@@ -515,15 +527,19 @@ def test_a_slider_is_hit_within_24_pixels(sizes):
     panel = panel_of(tabs_of(sizes, 3, "Spectrum"))
     handle, track = panel.locator("[role=slider]").first, panel.locator(".noUi-base").first
     panel.get_by_text("first k").scroll_into_view_if_needed()
-    sizes.wait_for_timeout(300)
-    before, box = float(handle.get_attribute("aria-valuenow")), track.bounding_box()
+
+    def value():
+        return float(handle.get_attribute("aria-valuenow"))
+
     for share, off in ((0.7, 11), (0.4, -11)):
-        y = box["y"] + box["height"] / 2 + off
-        sizes.mouse.click(box["x"] + share * box["width"], y)
-        now = float(handle.get_attribute("aria-valuenow"))
-        assert now != before
-        before = now
-        sizes.wait_for_timeout(500)  # the knob moves there
+        before = value()
+
+        def click(share=share, off=off):
+            box = track.bounding_box()
+            y = box["y"] + box["height"] / 2 + off
+            sizes.mouse.click(box["x"] + share * box["width"], y)
+
+        settled(sizes, lambda before=before: value() != before, click)
 
 
 # ---- far kernels
@@ -589,9 +605,9 @@ def test_a_marker_never_returns_to_an_older_place_however_far_the_kernel(far):
         if i in (21, 23, 25):  # clicks, whose answers come when the pointer is elsewhere
             far.mouse.down()
             far.mouse.up()
-    far.wait_for_timeout(1500)
-    picks = [text for text in far.evaluate("window.sent") if '"picked"' in text]
-    assert len(picks) >= 2
+    picks = "window.sent.filter((text) => text.includes('\"picked\"')).length >= 2"
+    far.wait_for_function(picks)
+    far.wait_for_timeout(1500)  # for all answers, whose effect is to be none
     places = far.evaluate("window.places")
     assert len(places) > 8
     assert returns(places) == [], len(places)
@@ -603,11 +619,13 @@ def test_the_answer_to_the_last_click_is_shown(far, study):
     far.mouse.move(box["x"] + 3, box["y"] + 3)
     for dx in (0.45, 0.55):
         far.mouse.click(box["x"] + box["width"] * dx, box["y"] + box["height"] / 2)
-    far.wait_for_timeout(1500)
+    last = canvas.evaluate(
+        "(c, [x, y]) => c.view.pick({ clientX: x, clientY: y }).vertex",
+        [box["x"] + box["width"] * dx, box["y"] + box["height"] / 2],
+    )
+    visible(far, ".s4a-readout").filter(has_text=f"template vertex {last} ").first.wait_for()
     picked = canvas.evaluate("(c) => c.view.points[0].slice(0, 3)")
-    text = visible(far, ".s4a-readout").filter(has_text="template vertex").first.inner_text()
-    vertex = int(re.search(r"template vertex (\d+)", text)[1])
-    np.testing.assert_allclose(picked, vertices(canvas)[vertex], atol=1e-3)
+    np.testing.assert_allclose(picked, vertices(canvas)[last], atol=1e-3)
     far.get_by_label("colours").filter(visible=True).select_option("checkerboard")
     far.wait_for_function(f"{SEEN}.every((v) => v.surfaces[0].cell > 0 && !v.points.length)")
 
@@ -630,12 +648,12 @@ def test_the_cursor_of_a_matrix_never_returns(far):
     box = matrix.bounding_box()
     for i in (4, 6, 8, 10, 12):
         far.mouse.click(box["x"] + box["width"] * i / 24.5, box["y"] + box["height"] * i / 24.5)
-        far.wait_for_timeout(120)
-    far.wait_for_timeout(2000)
+        far.wait_for_timeout(120)  # the answers come between the clicks
+    visible(far, ".s4a-title").filter(has_text="φ11 on").first.wait_for()
+    far.wait_for_timeout(500)
     cells = far.evaluate("window.cells")
     assert len(cells) == 6
     assert returns(cells) == [], cells
-    visible(far, ".s4a-title").filter(has_text="φ11 on").first.wait_for()
 
 
 def test_without_webgl_the_notebook_shows_still_pictures(flat, lab, study):
@@ -783,12 +801,13 @@ def test_full_resolution_is_drawn_once_after_a_drag_and_not_within(show, study):
     before, box = canvas.evaluate(SMOOTH), canvas.bounding_box()
     page.mouse.move(box["x"] + 100, box["y"] + 100)
     page.mouse.down()
-    for step in range(4):
+    for step in range(2):
         page.mouse.move(box["x"] + 110 + 10 * step, box["y"] + 120)
         page.wait_for_timeout(600)
     assert canvas.evaluate(SMOOTH) == before
     page.mouse.up()
-    page.wait_for_timeout(1000)
+    settled(page, lambda: canvas.evaluate(SMOOTH) > before)
+    page.wait_for_timeout(600)
     assert canvas.evaluate(SMOOTH) == before + 1
     # after a long frame it waits for four times as long
     waited = canvas.evaluate("""async (c) => {
@@ -800,6 +819,12 @@ def test_full_resolution_is_drawn_once_after_a_drag_and_not_within(show, study):
       return performance.now() - start;
     }""")
     assert waited >= 800
+
+
+@pytest.fixture
+def few_values(monkeypatch):
+    """A page keeps three values of a slider instead of two dozen."""
+    monkeypatch.setattr(panel_page, "LADDER", 3)
 
 
 @pytest.fixture(scope="module")
@@ -850,7 +875,7 @@ def test_the_page_of_a_study_has_no_serious_barrier_and_one_screen_an_idea(show,
 
 
 @pytest.mark.parametrize("kind", ["Modes", "Network", "Median", "Transfer", "Comparison"])
-def test_a_saved_panel_has_no_serious_barrier(show, study, compared, kind):
+def test_a_saved_panel_has_no_serious_barrier(show, study, compared, few_values, kind):
     panel = getattr(widgets, kind)(compared if kind == "Comparison" else study)
     assert barriers(show(panel, limit=200_000)) == []
 
@@ -897,7 +922,9 @@ def test_the_page_of_the_network_says_which_maps_are_in_no_cycle(show, study):
 def map_page(study, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "map.html"
     panel = widgets.FunctionalMap(study)
-    panel.save_html(path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(panel_page, "LADDER", 4)
+        panel.save_html(path)
     panel.close()
     return path
 
@@ -951,7 +978,7 @@ def test_the_axes_of_a_matrix_number_its_cells_and_nothing_overlaps(show, map_pa
     assert max(box["x"] + box["width"] for box in boxes) <= width
 
 
-def test_the_page_of_the_median_ranks_by_the_operator_that_is_chosen(show, study):
+def test_the_page_of_the_median_ranks_by_the_operator_that_is_chosen(show, study, few_values):
     page = show(widgets.Median(study))
     chosen(page, "operator", "conformal")
     D = study["latent"]["conformal_difference"].values

@@ -16,11 +16,14 @@ from browsing import (
     check_barriers,
     check_read,
     check_themes,
+    lay_out,
     needed,
     notebooks,
     pixels,
+    redrawn,
     run_notebook,
     serious,
+    settled,
     visible,
     watched,
 )
@@ -92,7 +95,6 @@ def panel_of(page, kind, *, wide):
     """A panel, where it is seen."""
     panel = page.locator(".s4a-panel").nth(2 * KINDS.index(kind) + wide)
     panel.scroll_into_view_if_needed()
-    page.wait_for_timeout(400)  # charts follow the width
     return panel
 
 
@@ -170,7 +172,7 @@ def test_a_lasso_tells_python_what_is_within_it(page):
     canvas = views(panel).first
     before, box = pixels(canvas), canvas.bounding_box()
     panel.get_by_role("button", name="lasso").click()
-    page.wait_for_timeout(500)
+    settled(page, lambda: canvas.evaluate("(c) => c.view.lasso"))
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(x - 60, y - 60)
     page.mouse.down()
@@ -188,23 +190,19 @@ def test_structures_are_hidden_and_coloured_and_their_poses_moved(page):
     panel = panel_of(page, "Structures", wide=True)
     before = pixels(views(panel).first)
     panel.get_by_label("right", exact=True).uncheck()
-    page.wait_for_timeout(800)
-    hidden = pixels(views(panel).first)
-    assert hidden != before
+    hidden = redrawn(views(panel).first, before)
     panel.get_by_label("the colour of left").evaluate(
         "(i) => { i.value = '#00ff00'; i.dispatchEvent(new Event('change', { bubbles: true })); }"
     )
-    page.wait_for_timeout(800)
-    assert pixels(views(panel).first) != hidden
+    coloured = redrawn(views(panel).first, hidden)
     panel.get_by_label("modes", exact=True).select_option(index=1)
-    page.wait_for_timeout(800)
+    still = redrawn(views(panel).first, coloured)
     assert views(panel).count() == 1
-    still = pixels(views(panel).first)
     slider = panel.locator(".s4a-slider input").filter(visible=True).first
     slider.focus()
     for _ in range(20):
         page.keyboard.press("ArrowRight")
-    assert pixels(views(panel).first) != still
+    redrawn(views(panel).first, still)
 
 
 def test_the_console_has_no_errors(page, messages):
@@ -237,14 +235,18 @@ def test_the_page_of_a_region_says_that_drawing_needs_python(show, study):
 
 def test_the_numbers_beside_bars_are_not_cut_in_a_narrow_panel(show, study):
     page = show(Median(study))
-    for width in (380, 700):
-        page.set_viewport_size({"width": width, "height": 900})
-        page.wait_for_timeout(300)
-        svg = visible(page, "svg.s4a-chart").first
+    svg = visible(page, "svg.s4a-chart").first
+
+    def uncut():
         right = svg.bounding_box()["x"] + svg.bounding_box()["width"]
         ends = [box["x"] + box["width"] for box in boxes_of(svg.locator("rect ~ text"))]
         assert len(ends) >= 4
         assert max(ends) <= right
+
+    for width in (380, 700):
+        page.set_viewport_size({"width": width, "height": 900})
+        lay_out(page)
+        settled(page, uncut)
         numbers = [text for text in svg.locator("rect ~ text").all_text_contents() if "." in text]
         assert len({len(text.partition(".")[2]) for text in numbers}) == 1, numbers
 

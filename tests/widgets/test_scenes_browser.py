@@ -4,7 +4,7 @@ import io
 
 import numpy as np
 import pytest
-from browsing import IDLE, needed, notebooks, run_notebook, serious, watched
+from browsing import IDLE, needed, notebooks, run_notebook, serious, settled, watched
 from PIL import Image
 
 import s4a
@@ -139,9 +139,13 @@ def test_a_slider_deforms_the_surface_and_sends_nothing_until_it_is_let_go(page)
     drawn(page, MODES, lambda picture: (body(picture) != body(before)).mean() > 0.01)
     assert len(page.sent) == sent
     move(slider, 3, let_go=True)
-    page.wait_for_timeout(500)
-    comms = [text for text in page.sent[sent:] if b"comm_msg" in bytes(text)]
-    assert len(comms) == 1, "one message tells Python where the slider stands"
+
+    def comms():
+        return [text for text in page.sent[sent:] if b"comm_msg" in bytes(text)]
+
+    settled(page, comms)
+    page.wait_for_timeout(300)  # no second one
+    assert len(comms()) == 1, "one message tells Python where the slider stands"
 
 
 def test_expansion_is_blue_and_compression_red_and_the_light_falls_on_both(page):
@@ -164,8 +168,6 @@ def test_the_mean_is_drawn_again_by_a_double_click(page):
 def test_the_deformed_surface_is_where_the_sum_of_modes_puts_it(page, study):
     """Its outline beside that of a surface of the same vertices, drawn by the CPU's numbers."""
     scores = [2.0, -1.5, 1.0]
-    for i, score in enumerate(scores):
-        move(page.locator(".s4a-scores input").nth(i), score)
     shape = s4a.synthesize(study, scores)["position"].values
     mean = s4a.synthesize(study, [0.0] * 3)["position"].values
     width = np.ptp(shape[:, 0]) / np.ptp(mean[:, 0])
@@ -175,12 +177,17 @@ def test_the_deformed_surface_is_where_the_sum_of_modes_puts_it(page, study):
         rows, columns = np.nonzero(body(picture))
         return np.ptp(columns), np.ptp(rows)
 
-    page.wait_for_timeout(1000)
-    moved = outline(seen(page, MODES))
-    for i in range(3):
-        move(page.locator(".s4a-scores input").nth(i), 0)
-    page.wait_for_timeout(1000)
-    still = outline(seen(page, MODES))
+    def outline_at(values):
+        before = seen(page, MODES)
+        for i, value in enumerate(values):
+            move(page.locator(".s4a-scores input").nth(i), value)
+        picture = drawn(page, MODES, lambda picture: (picture != before).any())
+        while (before != picture).any():  # until it is at rest
+            page.wait_for_timeout(300)
+            before, picture = picture, seen(page, MODES)
+        return outline(picture)
+
+    moved, still = outline_at(scores), outline_at([0, 0, 0])
     assert moved[0] / still[0] == pytest.approx(width, abs=0.04)
     assert moved[1] / still[1] == pytest.approx(height, abs=0.04)
 

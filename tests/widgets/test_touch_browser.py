@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from browsing import DRAWN, VIEW, needed, visible, watched
+from browsing import DRAWN, VIEW, needed, settled, visible, watched
 
 from s4a import widgets
 
 pytestmark = needed
-expect = pytest.importorskip("playwright.sync_api").expect
+pytest.importorskip("playwright.sync_api")
 
 WIDTH, HEIGHT = 390, 844
 CAMERA = "(c) => ({ rotation: [...c.view.camera.rotation], zoom: c.view.camera.zoom })"
@@ -56,19 +56,7 @@ def touch(page, *paths, steps=10):
     for step in range(steps):
         tell("touchMove", (step + 1) / steps)
     tell("touchEnd")
-    page.wait_for_timeout(400)
     session.detach()
-
-
-def tap(button, taken):
-    """Tap until `taken()`: a busy browser takes a tap for the end of a scroll."""
-    for _ in range(10):
-        button.tap()
-        for _ in range(10):  # the browser makes a click of it
-            button.page.wait_for_timeout(50)
-            if taken():
-                return
-    raise AssertionError("no tap became a click")
 
 
 @pytest.fixture
@@ -84,17 +72,27 @@ def surface(matches):
 def test_one_finger_scrolls_the_page_until_it_is_told_to_turn(matches, surface):
     canvas, middle = surface
     before = canvas.evaluate(CAMERA)
-    touch(matches, (middle + [0, 60], middle - [0, 120]))
-    assert matches.evaluate("scrollY") > 50
+    button = matches.get_by_role("button", name="one finger rotates the surface").first
+
+    def drag():
+        touch(matches, (middle + [0, 60], middle - [0, 120]))
+
+    def tap(pressed):
+        settled(matches, lambda: button.get_attribute("aria-pressed") == pressed, button.tap)
+
+    settled(matches, lambda: matches.evaluate("scrollY") > 50, drag)
     assert canvas.evaluate(CAMERA) == before
 
     matches.evaluate("scrollTo(0, 0)")
-    button = matches.get_by_role("button", name="one finger turns the surface").first
-    tap(button, lambda: button.get_attribute("aria-pressed") == "true")
-    touch(matches, (middle + [0, 60], middle - [0, 120]))
+    tap("true")
+    matches.evaluate("scrollTo(0, 0)")
+    settled(
+        matches,
+        lambda: not np.allclose(canvas.evaluate(CAMERA)["rotation"], before["rotation"]),
+        drag,
+    )
     assert matches.evaluate("scrollY") == 0
-    assert not np.allclose(canvas.evaluate(CAMERA)["rotation"], before["rotation"])
-    tap(button, lambda: button.get_attribute("aria-pressed") == "false")
+    tap("false")
 
 
 def test_what_two_fingers_hold_stays_under_them(matches, surface):
@@ -102,20 +100,28 @@ def test_what_two_fingers_hold_stays_under_them(matches, surface):
     before = canvas.evaluate(CAMERA)
     start, end = middle + [20, 10], middle + [-15, 40]
     held = canvas.evaluate(PICKED, start.tolist())
-    touch(matches, *[(start + s * np.array([30, 0]), end + s * np.array([60, 0])) for s in (-1, 1)])
-    after = canvas.evaluate(CAMERA)
-    assert after["zoom"] == pytest.approx(2 * before["zoom"], rel=0.02)
-    assert after["rotation"] == before["rotation"]
-    there = canvas.evaluate(PICKED, end.tolist())
     size = np.ptp(canvas.evaluate("(c) => [...c.view.surfaces[0].position]"))
-    np.testing.assert_allclose(there, held, atol=0.02 * size)
+    fingers = [(start + s * np.array([30, 0]), end + s * np.array([60, 0])) for s in (-1, 1)]
+
+    def spread():
+        canvas.evaluate("(c) => c.view.reset()")
+        touch(matches, *fingers)
+
+    def held_under_them():
+        after = canvas.evaluate(CAMERA)
+        assert after["zoom"] == pytest.approx(2 * before["zoom"], rel=0.02)
+        assert after["rotation"] == before["rotation"]
+        there = canvas.evaluate(PICKED, end.tolist())
+        np.testing.assert_allclose(there, held, atol=0.02 * size)
+
+    settled(matches, held_under_them, spread)
     assert matches.evaluate("[scrollY, visualViewport.scale]") == [0, 1], "not the page"
 
 
 def test_a_tap_picks_a_vertex(matches, surface):
     canvas, middle = surface
-    matches.touchscreen.tap(*middle)
-    matches.wait_for_function(f"document.querySelector('{VIEW}').view.points.length === 1")
+    picked = f"document.querySelector('{VIEW}').view.points.length === 1"
+    settled(matches, lambda: matches.evaluate(picked), lambda: matches.touchscreen.tap(*middle))
     point = canvas.evaluate("(c) => c.view.points[0].slice(0, 3)")
     vertex = canvas.evaluate(
         "(c, [x, y]) => c.view.pick({ clientX: x, clientY: y }).vertex", middle.tolist()
@@ -134,11 +140,11 @@ def test_every_surface_has_buttons_that_zoom_in_and_out_and_reset(matches, surfa
     def zoom():
         return canvas.evaluate(CAMERA)["zoom"] / home["zoom"]
 
-    tap(zoom_in.first, lambda: zoom() > 1.4)
-    tap(zoom_out.first, lambda: zoom() < 1.1)
+    settled(matches, lambda: zoom() > 1.4, zoom_in.first.tap)
+    settled(matches, lambda: zoom() < 1.1, zoom_out.first.tap)
     assert zoom() == pytest.approx(1)
-    tap(zoom_out.first, lambda: zoom() < 0.9)
-    tap(reset.first, lambda: canvas.evaluate(CAMERA) == home)
+    settled(matches, lambda: zoom() < 0.9, zoom_out.first.tap)
+    settled(matches, lambda: canvas.evaluate(CAMERA) == home, reset.first.tap)
 
 
 # the controls of a page that are smaller than a finger needs
