@@ -426,7 +426,7 @@ def variance(high: np.ndarray | list[Any], low: np.ndarray | list[Any] | None = 
             share = np.cumsum(np.asarray(values)[:20])
             count = np.arange(1, len(share) + 1)
             ax.plot(count, share, "o-", color=color, label=label, **marker)
-    ax.set(xlabel="number of principal components", ylabel="explained variance", ylim=(0, 1.03))
+    ax.set(xlabel="number of modes", ylabel="explained variance", ylim=(0, 1.03))
     ax.yaxis.set_major_formatter(PercentFormatter(1))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.grid(axis="y", color="#dddddd")
@@ -440,7 +440,7 @@ def scores(
     highlight: int | None = None,
     faint: Sequence[bool] | None = None,
 ) -> Figure:
-    """Draw the scores of the shapes on the first principal components, in standard deviations.
+    """Draw the scores of the shapes on the first modes of variation, in standard deviations.
 
     Shapes that are `faint` are grey.
 

@@ -51,7 +51,7 @@ two = pytest.mark.parametrize("page", ["FunctionalMap"], indirect=True)
 
 
 @modes
-def test_a_picture_of_4k_has_surface_and_colour_bar_on_the_chosen_ground(page):
+def test_a_picture_of_4k_has_surface_and_colour_bar_on_the_given_background(page):
     with Image.open(io.BytesIO(downloaded(page, "Save picture", width="3840"))) as picture:
         assert picture.width == 3840
         small = picture.convert("RGBA").resize((384, picture.height // 10))

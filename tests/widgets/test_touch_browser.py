@@ -69,7 +69,7 @@ def surface(matches):
     return canvas, np.array([box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
 
 
-def test_one_finger_scrolls_the_page_until_it_is_told_to_turn(matches, surface):
+def test_one_finger_scrolls_the_page_until_it_is_set_to_rotate(matches, surface):
     canvas, middle = surface
     before = canvas.evaluate(CAMERA)
     button = matches.get_by_role("button", name="one finger rotates the surface").first
