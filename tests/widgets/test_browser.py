@@ -311,7 +311,7 @@ def test_whatever_can_be_clicked_has_a_name_and_is_reached_by_the_keyboard(page)
         open_tab(page, title)
         for canvas in visible(page, VIEW).all():
             assert canvas.get_attribute("tabindex") == "0"
-            assert "arrow keys turn" in canvas.get_attribute("aria-label")
+            assert "arrow keys rotate" in canvas.get_attribute("aria-label")
         unnamed = page.evaluate(
             "[...document.querySelectorAll("
             "'.s4a input, .s4a select, .s4a button, .s4a [role=button]')]"
@@ -685,7 +685,7 @@ def test_an_analysis_is_opened_while_it_runs_and_cancelled_and_resumed(
     page.locator(".jupyter-widgets .lm-TabBar-tabLabel", has_text="Spectrum").first.click()
     page.wait_for_function(DRAWN)
     page.get_by_role("button", name="Cancel", exact=True).click()
-    page.wait_for_selector("text=cancelled; Resume")
+    page.wait_for_selector("text=cancelled; press Resume")
     kept = {path: path.stat().st_mtime_ns for path in (folder / "run" / "coarse").glob("*.nc")}
     assert kept, "remeshed before the button came; how many, the machine's speed decides"
     assert not (folder / "run" / "pca.nc").exists()
@@ -757,7 +757,7 @@ def test_one_mode_has_no_chart_of_the_variance_of_many(show, study, components):
     some["pca"] = type(study)(study["pca"].to_dataset().isel(component=slice(components)))
     page = show(widgets.Modes(some))
     assert page.get_by_text("Scores: click").count() == 1
-    assert page.get_by_text("Cumulative variance").count() == components - 1
+    assert page.get_by_text("Explained variance").count() == components - 1
 
 
 def test_a_lasso_selects_the_visible_vertices_inside(show, study):
@@ -995,7 +995,7 @@ def test_the_page_of_the_median_ranks_by_the_selected_operator(show, study, few_
 
 def test_the_page_of_the_spectrum_shows_eigenfunctions_and_reconstructions(show, study):
     page = show(widgets.Spectrum(study))
-    move(page.locator("#c-mode"), 7)
+    move(page.locator("#c-index"), 7)
     visible(page, ".s4a-title").filter(has_text="φ7 of brain_01").wait_for()
     canvas = visible(page, VIEW).nth(1)
     before = vertices(canvas)

@@ -61,7 +61,7 @@ def test_a_picture_of_4k_has_surface_and_colour_bar_on_the_given_background(page
     assert 0.1 < (surface.min(-1) < 250).mean() < 0.9
     bar = reddest(Image.fromarray(np.asarray(small)[-40:]))
     assert bar.min() < -60 < 60 < bar.max()
-    content = downloaded(page, "Save picture", width="600", ground="")
+    content = downloaded(page, "Save picture", width="600", background="")
     with Image.open(io.BytesIO(content)) as picture:
         opacity = np.asarray(picture)[..., 3]
     assert (opacity[0, 0], opacity.max()) == (0, 255)
