@@ -824,7 +824,7 @@ def test_full_resolution_is_drawn_once_after_a_drag(show, study):
 @pytest.fixture
 def few_values(monkeypatch):
     """A page keeps three values of a slider instead of two dozen."""
-    monkeypatch.setattr(panel_page, "LADDER", 3)
+    monkeypatch.setattr(panel_page, "N_VALUES", 3)
 
 
 @pytest.fixture(scope="module")
@@ -923,7 +923,7 @@ def map_page(study, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "map.html"
     panel = widgets.FunctionalMap(study)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(panel_page, "LADDER", 4)
+        patch.setattr(panel_page, "N_VALUES", 4)
         panel.save_html(path)
     panel.close()
     return path
