@@ -154,7 +154,7 @@ def test_what_a_match_has_wrong_on_its_own_is_seen_by_going_round_it(study):
     assert between_paths(path_differences(model_of(alike))) < 0.4 * turned
 
 
-def test_a_shape_that_stands_apart_from_the_network_is_registered_onto_no_other(study):
+def test_a_shape_that_is_excluded_from_the_network_is_registered_onto_no_other(study):
     latent = study["latent"].to_dataset()
     name = next(iter(path_differences(model_of(study))))
     without = study.copy()

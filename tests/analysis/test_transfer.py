@@ -215,7 +215,7 @@ def test_sure_votes_stay_where_they_fall():
     assert vote[sure] == pytest.approx(sides[sure], abs=1e-4)
 
 
-def test_blurred_votes_are_nearer_to_the_truth_and_no_label_is_lost(study, meshes):
+def test_blurred_votes_are_more_accurate_and_no_label_is_lost(study, meshes):
     label = meshes["brain_01"]["label"].values.copy()
     sharp, blurred = (transfer_labels(study, label, blur=blur) for blur in (0, 1))
     for name in sharp.children:

@@ -259,7 +259,7 @@ def test_flags_and_their_help_follow_from_a_function():
     assert "how often (default: 2)" in said
 
 
-def test_demo_finds_the_planted_modes_and_writes_its_page(tmp_path, monkeypatch, capsys):
+def test_demo_finds_the_simulated_modes_and_writes_its_page(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("s4a.write_page", lambda tree, file, **_: file.write_text("page"))
     out = tmp_path / "demo"
     assert (

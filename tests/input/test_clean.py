@@ -118,7 +118,7 @@ def test_holes_and_genus_are_counted():
 # vertices
 
 
-def test_a_triangle_soup_is_welded():
+def test_a_triangle_unconnected_is_welded():
     X, T = sphere()
     noise = 1e-8 * np.random.default_rng(0).normal(size=(3 * len(T), 3))
     for unconnected in (

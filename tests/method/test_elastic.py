@@ -57,7 +57,7 @@ def ends(pair):
     ]
 
 
-def test_they_end_nearer_to_the_truth_than_joint_rounds(pair, ends):
+def test_they_end_more_accurate_than_joint_rounds(pair, ends):
     template, shape, truth = pair
     near = shape.low.tree.query(template.low.tree.data)[1]
     warp = spectral_icp.coarse_spectral_icp(shape.low, template.low, near, k=60)[1]

@@ -1,4 +1,4 @@
-"""Shapes in far poses: parts that turn on their own, initial maps that no pose changes.
+"""Large pose differences: articulated parts, and initial maps that are invariant to the pose.
 
 And who pays for them.
 """

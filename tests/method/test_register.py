@@ -72,7 +72,7 @@ def test_a_shape_registered_to_itself_does_not_move(template, size):
     assert found["fmap"].values == pytest.approx(np.eye(60), abs=1e-6)
 
 
-def test_a_planted_deformation_is_recovered_and_better_than_by_nearest_neighbours(
+def test_a_simulated_deformation_is_recovered_and_better_than_by_nearest_neighbours(
     pair, template, deformed, true_displacement, size
 ):
     true = deformed["position"].values

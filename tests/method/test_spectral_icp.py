@@ -41,7 +41,7 @@ def test_the_joint_rounds_leave_the_identity_alone(surface):
 
 
 @pytest.mark.parametrize("spectral_weight", [0.0, 0.1])
-def test_a_planted_deformation_is_recovered_and_far_better_than_by_nearest_neighbours(
+def test_a_simulated_deformation_is_recovered_and_far_better_than_by_nearest_neighbours(
     surface, spectral_weight
 ):
     source = moved(surface, surface.X + bumps(surface.X))
@@ -68,7 +68,7 @@ def test_a_rigid_motion_is_recovered_exactly_without_any_deformation(surface):
     assert np.abs(c).max() < 1e-9
 
 
-def test_the_dense_rounds_keep_a_planted_deformation_of_the_span(surface):
+def test_the_dense_rounds_keep_a_simulated_deformation_of_the_span(surface):
     c = np.zeros((60, 3))
     c[4:12] = np.random.default_rng(0).normal(0, 0.008, (8, 3))
     source = moved(surface, surface.X + surface.Phi @ c)

@@ -180,7 +180,7 @@ def test_a_study_keeps_its_landmarks_and_says_who_has_none(marked, tmp_path):
     assert "brain_04" in study["report"].attrs["remarks"]
 
 
-def test_a_file_of_landmarks_that_changes_makes_its_shape_anew_and_no_other(marked, tmp_path):
+def test_a_file_of_landmarks_that_changes_makes_its_shape_again_and_no_other(marked, tmp_path):
     meshes, folder = marked
     own = tmp_path / "marks"
     own.mkdir()

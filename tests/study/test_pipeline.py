@@ -406,7 +406,7 @@ def test_a_second_run_in_the_same_folder_is_refused(brains, study_folder):
         analyse(brains, store=study_folder, **OPTIONS)
 
 
-def test_the_registered_surface_is_four_times_nearer_to_the_truth_than_nearest_neighbours():
+def test_the_registered_surface_is_four_times_more_accurate_than_nearest_neighbours():
     tree = synthetic.brains(4, 8000)
     truth = tree["truth"]
     found = analyse(tree, n_coarse=3000, n_jobs=1)

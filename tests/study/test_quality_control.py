@@ -72,7 +72,7 @@ def test_a_shape_with_too_few_eigenfunctions_is_excluded_and_takes_no_k_from_the
     assert study["network"]["fmap"].shape[1:] == (20, 20)
 
 
-def test_doubtful_shapes_are_registered_and_named(study):
+def test_flagged_shapes_are_registered_and_named(study):
     report = study["report"].to_dataset().sel(shape=FLAGGED)
     assert report["status"].values.tolist() == ["flagged"] * 2
     assert report["flag_kinds"].values.tolist() == ["unit"] * 2
@@ -86,7 +86,7 @@ def test_doubtful_shapes_are_registered_and_named(study):
     assert (match.values == np.arange(match.size)).mean() > 0.9  # the same surface, smaller
 
 
-def test_a_finished_study_with_doubtful_shapes_is_not_computed_again(folder, mixed):
+def test_a_finished_study_with_flagged_shapes_is_not_computed_again(folder, mixed):
     kept = [path for stage in ("latent", "registration") for path in (folder / stage).glob("*.nc")]
     before = {path: path.stat().st_mtime_ns for path in kept}
     analyse(mixed, store=folder, **OPTIONS).close()
@@ -126,7 +126,7 @@ def test_a_run_can_stop_at_them_before_its_long_stages(mixed, tmp_path):
         analyse(mixed, quality_control="stop", include_flagged=True, **OPTIONS)
 
 
-def test_a_doubtful_shape_is_the_template_where_it_is_named(mixed):
+def test_a_flagged_shape_is_the_template_where_it_is_named(mixed):
     study = analyse(mixed, template="a_metre", **OPTIONS)
     assert study["registration"].attrs["template"] == "a_metre"
     assert left_out(study) == ["z_inch"]
@@ -173,7 +173,7 @@ def test_the_summary_begins_with_what_to_decide_and_fits_on_a_screen(study):
     assert max(map(len, lines)) <= 100
 
 
-def test_a_summary_of_many_doubts_long_names_and_long_commands_fits_on_a_screen_too(study):
+def test_a_summary_of_many_flags_long_names_and_long_commands_fits_on_a_screen_too(study):
     report = study["report"].to_dataset()
     n = 60
     names = [f"{i:03d}_{'of_a_very_long_name_' * 4}" for i in range(n)]

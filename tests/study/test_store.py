@@ -268,7 +268,7 @@ def test_parts_of_a_registration_are_parts_of_the_whole(study_folder, study):
     assert open_study(study_folder)["registration"]["displacement"].identical(whole)
 
 
-def test_a_file_written_anew_after_it_was_opened_is_refused(tmp_path):
+def test_a_file_written_again_after_it_was_opened_is_refused(tmp_path):
     store.write(dataset(position=np.zeros((700, 3))), tmp_path / "a.nc", "k")
     found = netcdf.open_file(tmp_path / "a.nc")
     store.write(dataset(position=np.ones((700, 3))), tmp_path / "a.nc", "other")

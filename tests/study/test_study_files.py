@@ -169,7 +169,7 @@ def test_a_larger_variable_is_checked_when_it_is_read_and_not_before(file):
         data["position"].load()
 
 
-def test_a_run_makes_damaged_files_anew_and_no_others_and_the_same_bytes(brains, folder):
+def test_a_run_makes_damaged_files_again_and_no_others_and_the_same_bytes(brains, folder):
     def states():
         return {p: p.stat().st_mtime_ns for p in folder.rglob("[!.]*.nc")}
 
