@@ -971,7 +971,7 @@ def test_a_full_page_lists_what_is_not_recorded(panel, tmp_path):
     text = path.read_text(encoding="utf-8")
     data = recording(text)
     shapes = next(control for control in data["controls"] if control["id"] == "c-choice")
-    assert shapes["open"] == [0]
+    assert shapes["recorded"] == [0]
     assert "Only in a notebook" in text
     assert "changing shape" in text
 
