@@ -504,7 +504,7 @@ def test_every_control_has_a_tooltip(sizes, title):
 
 
 def test_sliders_keep_their_arrow_keys_in_notebook_7(sizes):
-    """Notebook 7 handles keys before the page unless the focused element suppresses its shortcuts."""
+    """Notebook 7 handles keys before the page, unless the focused element prevents that."""
     sizes.evaluate("""() => document.addEventListener("keydown", (event) => {
       if (event.target.hasAttribute("data-lm-suppress-shortcuts")) return;
       event.preventDefault();
