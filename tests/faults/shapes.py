@@ -330,7 +330,7 @@ FAULTS = [
           "an extent of at least 1e-15 needed, found",
           "excluded, because its square underflows", "scale the file"),
     Fault("an offset that exceeds the precision", "lost.ply", of(32, lambda X, T: (X + 1e8, T)),
-          "excluded", "lost in rounding: its extent is .* float32",
+          "excluded", "lost in rounding: the extent is .* float32",
           "excluded: from 1e5 times the extent in float32 files, 1e11 times in float64",
           "subtract the offset before the file is written"),
     Fault("fewer vertices than the target resolution", "few.ply", of((25, 80)), "ok", "",
