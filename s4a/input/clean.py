@@ -71,7 +71,7 @@ def clean(
 
     Vertices within 1e-7 of the bounding-box diagonal are welded.  Degenerate and duplicate
     triangles are dropped, and zero-area triangles are removed by flipping their long edge.
-    Non-manifold edges and vertices are split [1]_, triangles are oriented consistently and
+    Non-manifold edges and vertices are split, triangles are oriented consistently and
     outwards, and small components are dropped.  Holes are kept unless `close_holes` is set.
 
     Parameters
@@ -105,8 +105,8 @@ def clean(
 
     References
     ----------
-    .. [1] A. Guéziec, G. Taubin, F. Lazarus, W. Horn, "Cutting and stitching: converting sets of
-       polygons to manifold surfaces", IEEE TVCG 7(2), 2001.
+    A. Guéziec, G. Taubin, F. Lazarus and W. Horn (2001), Cutting and stitching: converting sets of
+    polygons to manifold surfaces, IEEE TVCG 7(2).
 
     Examples
     --------

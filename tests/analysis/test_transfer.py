@@ -342,7 +342,7 @@ def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
             4,
             r"one array of 4 values needed, found p \(4,\), q \(4,\); name it as two.npz:NAME",
         ),
-        ("two.npz:r", 4, "no array 'r'; it has p, q"),
+        ("two.npz:r", 4, "an array 'r' needed, found p, q"),
         ("a.csv", 1, "a column 'label' needed, found p, q"),
         ("none.npy", 1, "no file .*none.npy"),
     ):

@@ -273,9 +273,9 @@ def test_reduced_numbers_are_told():
     assert "all 1 pairs of 2 shapes are used (n_pairs = 500)" in report.attrs["remarks"]
     assert report["status"].sel(shape="b").item() == "excluded"
     why = report["reason"].sel(shape="b").item()
-    assert re.search(r"only 1\d eigenfunctions, where 2 of 3 shapes have 40 or more", why)
+    assert re.search(r"only 1\d eigenfunctions, but 2 of 3 shapes have 40 or more", why)
     assert (
-        "all vertices are used, as there are fewer than n_coarse = 100"
+        "all vertices used, as there are fewer than n_coarse = 100"
         in report["reason"].sel(shape="a").item()
     )
 

@@ -208,7 +208,7 @@ LACKS = "an element vertex with x, y and z expected, found"
     [
         ("element vertex", "element point", f"{LACKS} point, face"),
         ("float z", "float w", f"{LACKS} an element vertex with x, y, w"),
-        ("float z", "real z", "of the types of PLY, expected, found 'property real z'"),
+        ("float z", "real z", "of a PLY type, expected, found 'property real z'"),
         ("format ascii", "format binary", "one of the formats .* in the header, found binary"),
     ],
 )

@@ -146,7 +146,7 @@ def test_names_of_shapes_are_unique_and_short_enough_for_the_files_of_a_study(fo
     assert len({name.casefold() for name in names}) == len(names)
     assert max(map(len, names)) == 100
     remarks = read_shapes(folder, compare=False)["report"].attrs["remarks"]
-    assert remarks.count("names of shapes have at most 100 letters") == 3
+    assert remarks.count("names of shapes have at most 100 characters") == 3
     alone = dict(find_meshes(folder, f"{LONG}1"))  # the name does not depend on other files
     assert set(alone.values()) < set(names)
 

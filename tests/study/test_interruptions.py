@@ -155,7 +155,7 @@ def test_temporary_studies_of_killed_runs_are_removed_and_those_of_others_stay(
         (tmp_path / name).mkdir()
     for name in ("s4a-abandond", "s4a-of_other"):
         (tmp_path / name / ".lock").write_text("")
-    with processes.held(tmp_path / "s4a-of_other"), processes.temporary_folder() as folder:
+    with processes.locked(tmp_path / "s4a-of_other"), processes.temporary_folder() as folder:
         assert folder.parent == tmp_path
         left = {path.name for path in tmp_path.iterdir()}
         assert left == {"s4a-of_other", "s4a-begin_ng", "s4a-thoughts", folder.name}
@@ -309,7 +309,9 @@ def test_files_that_vanish_or_change_while_they_are_read_end_the_run_which_then_
     for happens in (change, remove):
         restore()
         monkeypatch.setattr(tasks, "read_shape", happens)
-        with pytest.raises(OSError, match=r"brain_02\.ply has changed or gone since the run began"):
+        with pytest.raises(
+            OSError, match=r"brain_02\.ply changed or disappeared since the run began"
+        ):
             analyse(meshes / "*.ply", store=folder, intersections=False, **OPTIONS)
         assert not (folder / "original" / "brain_02.nc").exists()
     restore()
@@ -485,7 +487,7 @@ def test_a_worker_of_a_run_that_is_over_writes_nothing(tmp_path):
     with store.lock(tmp_path) as old:
         store.write(synthetic.sphere(50), tmp_path / "a.nc", "key", claim=old)
     with store.lock(tmp_path) as new:
-        with pytest.raises(ValueError, match=f"the run of process {os.getpid()} no longer holds"):
+        with pytest.raises(ValueError, match=f"process {os.getpid()} no longer has the lock"):
             store.write(synthetic.sphere(60), tmp_path / "a.nc", "key", claim=old)
         assert netcdf.read(tmp_path / "a.nc").sizes["vertex"] == 50
         store.write(synthetic.sphere(60), tmp_path / "a.nc", "key", claim=new)
@@ -553,7 +555,7 @@ def test_a_disk_that_takes_no_more_ends_in_one_error_and_leaves_whole_files(
     lines = [line for line in found.stderr.splitlines() if line.startswith("s4a: ")]
     assert len(lines) == 1, found.stderr
     assert "cannot be written" in lines[0]
-    assert "goes on where it stopped" in lines[0]
+    assert "resumes the run" in lines[0]
     whole = sorted(folder.rglob("[!.]*.nc"))
     assert whole
     assert all(netcdf.attributes(path)["task_key"] for path in whole)

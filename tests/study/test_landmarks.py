@@ -176,7 +176,7 @@ def test_a_study_keeps_its_landmarks_and_says_who_has_none(marked, tmp_path):
     spacing = np.sqrt(coarse["vertex_area"].values.sum() / coarse.sizes["vertex"])
     away = np.linalg.norm(near - study["original/brain_01"]["guide_position"].values, axis=1)
     assert away.max() < 2 * spacing
-    assert "1 of 4 shapes have no file of landmarks" in study["report"].attrs["remarks"]
+    assert "1 of 4 shapes have no landmark file" in study["report"].attrs["remarks"]
     assert "brain_04" in study["report"].attrs["remarks"]
 
 
@@ -234,7 +234,7 @@ def test_the_command_line_takes_them_for_a_study_and_for_new_shapes(marked, tmp_
     files = sorted((tmp_path / "scans").glob("*.ply"))
     arguments = ["run", *map(str, files[1:]), "--landmarks", str(folder)]
     assert cli.main([*arguments, "--out", str(tmp_path / "study"), *FLAGS]) == 0
-    assert "no file of landmarks" in capsys.readouterr().out
+    assert "no landmark file" in capsys.readouterr().out
     arguments = ["insert", str(tmp_path / "study"), str(files[0]), "--landmarks", str(folder)]
     assert cli.main([*arguments, "--out", str(tmp_path / "new")]) == 0
     study = open_study(tmp_path / "study")

@@ -44,7 +44,7 @@ def test_a_run_that_goes_on_or_is_stopped_says_how_far_it_is(brains, tmp_path, m
     (found,) = seen
     assert (found.state, found.processes >= 1, found.memory > 10) == ("running", True, True)
     now, before = found.stages["remesh and spectrum"], found.stages["compare"]
-    assert (now.done, now.all, now.had, now.ended) == (2, 4, 0, False)
+    assert (now.done, now.all, now.done_before, now.ended) == (2, 4, 0, False)
     assert (before.done, before.all, before.ended) == (4, 4, True)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("running since 20")

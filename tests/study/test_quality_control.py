@@ -68,7 +68,7 @@ def test_the_results_of_the_others_are_the_same_to_the_bit_as_without(alone, stu
 def test_a_shape_with_too_few_eigenfunctions_is_excluded_and_takes_no_k_from_the_others(study):
     report = study["report"].to_dataset().sel(shape="corner")
     assert report["status"].item() == "excluded"
-    assert "only 2 eigenfunctions, where 5 of 5 shapes have 20 or more" in report["reason"].item()
+    assert "only 2 eigenfunctions, but 5 of 5 shapes have 20 or more" in report["reason"].item()
     assert study["network"]["fmap"].shape[1:] == (20, 20)
 
 
@@ -130,7 +130,7 @@ def test_a_doubtful_shape_is_the_template_where_it_is_named(mixed):
     study = analyse(mixed, template="a_metre", **OPTIONS)
     assert study["registration"].attrs["template"] == "a_metre"
     assert left_out(study) == ["z_inch"]
-    assert "a_metre, which was named, is itself flagged" in study["report"].attrs["remarks"]
+    assert "a_metre, given by name, is flagged" in study["report"].attrs["remarks"]
 
 
 def test_where_fewer_than_two_are_beyond_doubt_all_are_treated_alike(good):

@@ -282,7 +282,7 @@ def test_a_folder_with_files_of_somebody_else_is_refused_and_not_touched(tmp_pat
     synthetic.sphere(50).to_netcdf(tmp_path / "original" / "mine.nc", engine="h5netcdf")
     (tmp_path / "original" / ".draft.tmp").write_bytes(b"mine")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    message = r"is no study and is not empty \(it has original, pca.nc\): give a new or an empty"
+    message = r"is not a study and not empty \(it has original, pca.nc\): give a new or an empty"
     with pytest.raises(ValueError, match=message), store.lock(tmp_path):
         pass
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

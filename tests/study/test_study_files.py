@@ -466,7 +466,7 @@ def test_verify_sees_that_other_programs_are_told_something_else(folder):
         file["position"].attrs["units"] = "m"
     row = verify(folder).sel(file="coarse/brain_01.nc")
     assert row["state"].item() == "damaged"
-    assert "its contents are not those of its HDF5" in row["fault"].item()
+    assert "the contents differ from the HDF5 data" in row["fault"].item()
 
 
 def test_an_unfinished_study_is_told_by_verify(folder):
