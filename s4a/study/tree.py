@@ -44,7 +44,7 @@ def template_mesh(original: xr.Dataset, name: str) -> xr.Dataset:
 def stack_registration(
     template: xr.Dataset, files: dict[str, xr.Dataset], names: list[str], *, lazily: bool = False
 ) -> dict[str, xr.Dataset]:
-    """Stack registrations to ``/registration``, with the inverse match of values shape below it.
+    """Stack registrations to ``/registration``, with the inverse match of each shape below it.
 
     Lengths have a unit if it is the same for all shapes.
 

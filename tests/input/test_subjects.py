@@ -177,8 +177,8 @@ def test_a_table_of_other_meshes_is_named(folder, brains, tmp_path):
     given = {NAMES[0]: given[NAMES[1]], NAMES[1]: given[NAMES[1]], NAMES[5]: brains[NAMES[5]]}
     with analyse(given, store=work, **OPTIONS) as other:
         remarks = other["report"].attrs["remarks"]
-    assert "three.csv, is kept, but it has no row for brain_06; it has rows for what is" in remarks
-    assert "no shape now: brain_03; other meshes have taken the names brain_01: give" in remarks
+    assert "three.csv, is kept, but it has no row for brain_06; it has rows for other" in remarks
+    assert "other shapes: brain_03; the meshes have changed: brain_01: give" in remarks
 
 
 def test_statistics_take_columns_and_say_which_values_are_missing(folder):
