@@ -566,11 +566,11 @@ def _pairs_around_edges(P, F, group, edge_of, count):
     """
     order = counting_order(edge_of, len(count))
     start_of_edge = np.cumsum(count) - count
-    pairs = [np.empty((0, 2), np.int64)]
+    blocks = [np.empty((0, 2), np.int64)]
     for k in range(3, _MOST_AROUND_EDGE + 1):
         around = order[start_of_edge[count == k][:, None] + np.arange(k)]  # (edges, k) half-edges
-        pairs += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
-    pairs = np.concatenate(pairs)
+        blocks += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
+    pairs = np.concatenate(blocks)
     h, g = pairs.T
     m = len(F)
     normal = triangle_normals(P, F)

@@ -15,7 +15,7 @@ LEFT = ["s1", "s3"]
 
 @pytest.fixture(scope="module")
 def right():
-    """Five shapes that clearly have a hand."""
+    """Five clearly chiral shapes."""
     return {f"s{i}": faulty.shape(300 + i) for i in range(5)}
 
 
@@ -27,7 +27,7 @@ def mixed(right):
 
 @pytest.fixture(scope="module")
 def folder(mixed, tmp_path_factory):
-    """The folder of a study that found the left ones itself."""
+    """The folder of a study with ``reflect="auto"``."""
     folder = tmp_path_factory.mktemp("reflect") / "study"
     analyse(mixed, store=folder, reflect="auto", **OPTIONS).close()
     return folder
@@ -48,7 +48,7 @@ def test_the_study_of_left_and_right_shapes_is_that_of_right_ones(right, mixed, 
         hand = found["report"]["mean_chirality"]
         assert (hand.sel(shape=LEFT) < -0.5).all()
         assert (hand.drop_sel(shape=LEFT) > 0.5).all()
-        assert "mirrored, as reflect= says" in study_html(found)
+        assert "mirrored by reflect=" in study_html(found)
     assert "mean_chirality" not in named["report"]
     assert s4a.Options.from_report(named).reflect == "s1,s3"
 
@@ -109,7 +109,7 @@ def test_a_new_shape_of_the_other_hand_is_mirrored_where_that_is_asked(newcomer,
             )
             assert found["report"]["reflected"].values.tolist() == [1]
             assert found["report"]["status"].values.tolist() == ["ok"]
-            assert "mirrored, as reflect= says" in found["report"]["reason"].values[0]
+            assert "mirrored by reflect=" in found["report"]["reason"].values[0]
             assert found["original/s9"].attrs["reflected"] == 1
         stayed = s4a.insert(study, {"s9": right}, reflect="auto", n_jobs=1)
     assert stayed["report"]["reflected"].values.tolist() == [0]
@@ -135,7 +135,7 @@ def test_a_hand_that_cannot_be_told_is_said_and_an_unknown_name_is_an_error(
         s4a.insert(open_study(folder), {"s9": newcomer[0]}, reflect="s8", n_jobs=1)
     brain = meshes["brain_02"]
     found = s4a.insert(study, {"again": brain}, reflect="auto", n_jobs=1)
-    said = "reflect='auto' left again as it is: the shapes of the study are too like their own"
+    said = "reflect='auto' left again as it is: the shapes of the study are too symmetric"
     assert said in found["report"].attrs["remarks"]
     assert said in caplog.text
     assert found["report"]["reflected"].values.tolist() == [0]
