@@ -42,10 +42,10 @@ def test_a_ball_lies_where_its_affine_puts_it_and_keeps_its_volume(tmp_path, nam
     kind = nibabel.MGHImage if ".mg" in name else nibabel.Nifti1Image
     path = write(tmp_path / name, 17 * inside.astype(np.uint8), kind=kind)
     X, T, attrs = read_volume(path, 17)
-    place = AFFINE[:3, :3] @ middle + AFFINE[:3, 3]
-    np.testing.assert_allclose((X.max(0) + X.min(0)) / 2, place, atol=0.1)
+    position = AFFINE[:3, :3] @ middle + AFFINE[:3, 3]
+    np.testing.assert_allclose((X.max(0) + X.min(0)) / 2, position, atol=0.1)
     voxels = inside.sum() * abs(np.linalg.det(AFFINE[:3, :3]))
-    assert enclosed(X - place, T) == pytest.approx(voxels, rel=0.01), "positive: outwards"
+    assert enclosed(X - position, T) == pytest.approx(voxels, rel=0.01), "positive: outwards"
     assert (attrs["unit"], attrs["coordinate_system"]) == ("mm", "RAS")
 
 
@@ -59,7 +59,7 @@ def test_smoothing_takes_the_steps_of_the_voxels_and_does_not_shrink(tmp_path):
     assert enclosed(smooth - middle, T) == pytest.approx(inside.sum(), rel=0.006)
 
 
-def test_both_hands_of_an_affine_give_surfaces_seen_from_outside(tmp_path):
+def test_affine_maps_of_either_orientation_give_outward_triangles(tmp_path):
     inside, middle = ball()
     for sign in (1, -1):
         affine = np.diag([sign, 1, 1, 1.0])
@@ -81,7 +81,7 @@ def test_several_labels_are_one_structure(tmp_path):
     assert len(read_volume(path, 2)[0]) < len(X)
 
 
-def test_a_structure_at_the_border_is_closed_and_that_is_said(tmp_path):
+def test_a_structure_at_the_border_is_closed_with_a_note(tmp_path):
     inside, _ = ball(middle=[3, 15, 15])
     shape = s4a.read_shape(write(tmp_path / "a.nii", inside.astype(np.uint8)), label=1)
     assert shape.attrs["holes"] == 0
@@ -90,7 +90,7 @@ def test_a_structure_at_the_border_is_closed_and_that_is_said(tmp_path):
     assert "border" not in whole.attrs["reason"]
 
 
-def test_of_several_components_the_largest_stays_and_the_others_are_told(tmp_path):
+def test_the_largest_of_several_components_is_kept_and_the_others_reported(tmp_path):
     values = ball()[0].astype(np.uint8)
     values[1:4, 1:4, 1:4] = 1
     path = write(tmp_path / "a.nii", values)

@@ -150,8 +150,8 @@ def test_what_unpacks_to_more_than_64_mib_and_200_times_its_size_is_refused(tmp_
 def test_a_gifti_file_opens_no_other_file(tmp_path):
     file(tmp_path / "secret", bytes(12))
     text = GIFTI.format("LABEL", "INT32", 3, "ExternalFileBinary", "")
-    found = "data inside the file expected, found ExternalFileBinary secret"
-    with pytest.raises(ValueError, match=found):
+    result = "data inside the file expected, found ExternalFileBinary secret"
+    with pytest.raises(ValueError, match=result):
         read_labels(file(tmp_path / "a.gii", text))
 
 
@@ -167,7 +167,7 @@ def test_an_array_that_promises_more_than_its_file_is_refused_before_room_is_mad
                 read_labels(file(tmp_path / name, data))
 
 
-def test_many_arrays_at_one_place_of_a_file_count_each(tmp_path):
+def test_arrays_that_share_bytes_of_a_file_count_each(tmp_path):
     raw = bytes(600_000)
     body = np.array([1, len(raw), 0, len(p := zlib.compress(raw))], "<u4").tobytes() + p
     piece = '<DataArray type="Float32" format="appended" offset="0"/>'

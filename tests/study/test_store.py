@@ -1,4 +1,4 @@
-"""A study on disk: keys, whole files, one run at a time, and what is read is what was written."""
+"""A study on disk: keys, complete files, one run at a time, round trips."""
 
 import os
 import subprocess
@@ -268,12 +268,12 @@ def test_parts_of_a_registration_are_parts_of_the_whole(study_folder, study):
     assert open_study(study_folder)["registration"]["displacement"].identical(whole)
 
 
-def test_a_file_written_anew_after_it_was_opened_is_refused(tmp_path):
+def test_a_file_written_again_after_it_was_opened_is_an_error(tmp_path):
     store.write(dataset(position=np.zeros((700, 3))), tmp_path / "a.nc", "k")
-    found = netcdf.open_file(tmp_path / "a.nc")
+    result = netcdf.open_file(tmp_path / "a.nc")
     store.write(dataset(position=np.ones((700, 3))), tmp_path / "a.nc", "other")
     with pytest.raises(ValueError, match="written again since it was opened; open the study again"):
-        found.load()
+        result.load()
 
 
 def test_a_folder_with_files_of_somebody_else_is_refused_and_not_touched(tmp_path):
