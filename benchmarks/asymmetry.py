@@ -68,7 +68,7 @@ def draw(rng: np.random.Generator, n: int, kind: str) -> np.ndarray:
 
 def found(a: np.ndarray, run: int, *, simulated: bool) -> list[float]:
     """Whether, or where, directional asymmetry and antisymmetry are found."""
-    model = Model.of_mean(len(a), N_PERMUTATIONS, run)
+    model = Model.one_sample(len(a), N_PERMUTATIONS, run)
     p_max = model.vertex_test(a)[2]
     rows = a[..., 0]
     at = (p_max[:N_PLANTED] <= 0.05).mean() if simulated else p_max.min() <= 0.05

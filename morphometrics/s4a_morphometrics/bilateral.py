@@ -244,13 +244,13 @@ def asymmetry(
         without = [*without, *alone]
         sides = both_sides(Y[first], Y[second], T, area)._replace(names=names)
         attrs |= {"symmetry": "matching", "sides": words}
-    model = Model.of_mean(len(sides.a), n_permutations, seed)
+    model = Model.one_sample(len(sides.a), n_permutations, seed)
     result = measured(sides, T, of, model)
     if halves is not None:
         result = result.merge(halves.drop_attrs())
     result = in_unit(result, unit_of(registration["displacement"]))
     return result.assign_coords(individual=sides.names, term=TERMS).assign_attrs(
-        left_out=", ".join(without), **attrs, **model.said()
+        left_out=", ".join(without), **attrs, **model.attributes()
     )
 
 
@@ -392,7 +392,7 @@ def sides_test(K: np.ndarray, model: Model) -> tuple[float, float]:
     >>> from s4a.analysis.permutation import Model
     >>> from s4a_morphometrics.bilateral import sides_test
     >>> a = 1 + 0.1 * np.arange(6.0)
-    >>> sides_test(np.outer(a, a), Model.of_mean(6))[1]
+    >>> sides_test(np.outer(a, a), Model.one_sample(6))[1]
     0.03125
     """
     n, total = len(K), np.trace(K)

@@ -279,7 +279,7 @@ def growth(
         of=of,
         subjects=len(np.unique(whose)),
         once=len(np.unique(whose[~seen])),
-        **sample.said,
+        **sample.attributes,
     )
 
 
@@ -300,7 +300,7 @@ def _with_subjects(study, sample, subject):
     if not known.all():
         lacking = shapes[~known].tolist()
         log.warning("no subject, and left out: %s", listed(lacking, most=9))
-        said = {**sample.said}
+        said = {**sample.attributes}
         said["left_out"] = ", ".join(filter(None, [said["left_out"], *lacking]))
         sample = sample._replace(
             registration=sample.registration.isel(shape=known),
@@ -371,7 +371,7 @@ def _test(sample, t, subject, seen, of, n_components, options):
     c = count_components(variance, dof, n_components, most=len(variance))
     statistic, p_value = model.test(V[:, :c] * np.sqrt(len(E) - 1))
     return found | {
-        "attrs": {"components": c} | model.said(),
+        "attrs": {"components": c} | model.attributes(),
         "effect_size": np.sqrt(squared_cohen_f(found["explained_share"])),
         # as many visits as are not taken by the means of subjects are free
         "statistic": statistic * (dof - 1) / (len(x) - 2 - rank),

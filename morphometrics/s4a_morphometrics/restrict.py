@@ -14,7 +14,7 @@ from s4a.analysis.inputs import (
     columns_of,
     covariates_of,
     displacements_of,
-    is_unknown,
+    lacks_value,
     registration_of,
 )
 from s4a.analysis.permutation import standardize
@@ -185,7 +185,7 @@ def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]
     registration, d, area = displacements_of(study)
     columns = covariates_of(study, nuisance)
     for name, values in columns.items():
-        lacking = registration["shape"].values[is_unknown(values)].tolist()
+        lacking = registration["shape"].values[lacks_value(values)].tolist()
         if lacking:
             raise ValueError(
                 f"a nuisance needs a value for every shape; {name} lacks {listed(lacking)}"

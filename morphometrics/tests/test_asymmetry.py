@@ -214,7 +214,7 @@ def test_what_triangles_and_partners_leave_is_no_asymmetry_of_the_whole_shape(ha
     a = found["asymmetry"].values.astype(float)
     area = vertex_areas(*MESH) / vertex_areas(*MESH).sum()
     K = np.einsum("inx,jnx,n->ij", a, a, area)
-    assert sides_test(K, Model.of_mean(len(K), 199))[1] < 0.05  # as they are
+    assert sides_test(K, Model.one_sample(len(K), 199))[1] < 0.05  # as they are
 
 
 def test_the_table_is_that_of_two_way_analysis_of_variance():
@@ -282,7 +282,7 @@ def test_what_cannot_be_tested_is_an_error(halves):
     with pytest.raises(ValueError, match="of must be 'vector' or 'normal'"):
         asymmetry(study, of="size")
     with pytest.raises(ValueError, match="4 needed, or fewer"):
-        Model.of_mean(3).vertex_test(np.ones((3, 5, 3)))
+        Model.one_sample(3).vertex_test(np.ones((3, 5, 3)))
     d = fields(7, 4)
     twice = matching(d, d)
     with pytest.raises(ValueError, match="left and right are the same in all shapes"):
@@ -295,27 +295,27 @@ def test_what_cannot_be_tested_is_an_error(halves):
 def test_the_test_of_a_mean_is_hotellings_and_students():
     rng = np.random.default_rng(0)
     d = rng.normal(size=(11, 4, 3)) + 0.3
-    share = Model.of_mean(11, 9).vertex_test(d)[0]
+    share = Model.one_sample(11, 9).vertex_test(d)[0]
     for v in range(4):
         mean, S = d[:, v].mean(0), np.cov(d[:, v].T)
         assert 10 * share[v] / (1 - share[v]) == pytest.approx(
             11 * mean @ np.linalg.solve(S, mean), rel=1e-4
         )
-    one = Model.of_mean(11, 9).vertex_test(d[..., :1])[0]
+    one = Model.one_sample(11, 9).vertex_test(d[..., :1])[0]
     t = stats.ttest_1samp(d[..., 0], 0).statistic
     assert 10 * one / (1 - one) == pytest.approx(t**2, rel=1e-4)
 
 
 def test_all_changes_of_sign_are_gone_through_where_they_are_few():
     a = np.arange(1.0, 6)
-    share, p, p_max = Model.of_mean(5).vertex_test(np.abs(a)[:, None, None])
-    assert p[0] == p_max[0] == sides_test(np.outer(a, a), Model.of_mean(5))[1] == 1 / 16
+    share, p, p_max = Model.one_sample(5).vertex_test(np.abs(a)[:, None, None])
+    assert p[0] == p_max[0] == sides_test(np.outer(a, a), Model.one_sample(5))[1] == 1 / 16
     assert share[0] == pytest.approx(a.sum() ** 2 / (5 * (a**2).sum()))
 
 
 def test_p_values_of_a_mean_of_zero_are_uniform():
     found = [
-        Model.of_mean(14, 99, seed).vertex_test(
+        Model.one_sample(14, 99, seed).vertex_test(
             np.random.default_rng(seed).normal(size=(14, 30, 3))
         )
         for seed in range(100)

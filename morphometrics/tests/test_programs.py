@@ -440,7 +440,7 @@ def test_a_mesh_in_lps_and_one_that_was_mirrored_fill_the_same_voxels(scans, tmp
         ("paraview", {"n_steps": 1}, "n_steps"),
         ("scalismo", {"n_modes": 0}, "n_modes"),
         ("nifti", {"label": np.array(["a"] * 1500)}, "whole numbers .* found <U1"),
-        ("nifti", {}, "brain_01 was made of no volume, but of arrays: give the scan"),
+        ("nifti", {}, "brain_01 was read from arrays, not from a volume: give a scan"),
         ("nifti", {"grid": "none.nii"}, "no file .*none.nii"),
     ],
 )
@@ -468,7 +468,7 @@ def test_a_grid_elsewhere_is_refused_and_says_where_the_surface_lies(scans, tmp_
     far = AFFINE.copy()
     far[:3, 3] += 5000
     nibabel.save(nibabel.Nifti1Image(np.zeros((9, 9, 9), np.uint8), far), tmp_path / "far.nii")
-    with pytest.raises(ValueError, match=r"no voxel of .*far.nii is within scan_0: .* mm \(RAS\)"):
+    with pytest.raises(ValueError, match=r"no voxel of .*far.nii is inside scan_0, .* mm \(RAS\)"):
         write_for(study, tmp_path, "nifti", label=halves(study), grid=tmp_path / "far.nii")
 
 

@@ -1,4 +1,4 @@
-"""Groups and variables (6.1): do shapes differ with them, and where on the template?"""
+"""Tests of shape against groups and variables (6.1), for whole shapes and at every vertex."""
 
 import logging
 from typing import Any
@@ -31,8 +31,8 @@ from s4a.seeds import RNG, seed_of
 
 log = logging.getLogger(__name__)
 
-# p of the test of equal scatter under which it is told: 2 of 100 times in vain, and 75 to 90 times
-# where groups of 10 and 10, or 15 and 5, have 1 and 2 standard deviations
+# level of the test of homogeneous covariance: 2 % false alarms, power 75 to 90 % for groups of
+# 10 and 10, or 15 and 5, shapes with 1 and 2 standard deviations
 UNEQUAL = 0.02
 
 
@@ -47,43 +47,55 @@ def group_test(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """Do groups of shapes differ?  Permutation Hotelling T^2 on the scores.
+    """Test whether the mean shapes of groups differ: permutation Hotelling T^2 test of the scores.
 
-    Covariance shrunk after Ledoit and Wolf.
+    The null hypothesis is that the groups have the same mean.  The covariance is shrunk after
+    Ledoit and Wolf (2004).
 
     Parameters
     ----------
     study : DataTree
     group : array_like (shape,), dict of shape to value, or name in /subjects
     covariates : as `group`, a dict of name to these, or an array_like (shape, covariate)
-        Or a list of names in /subjects.  Accounted for after Freedman and Lane (1983); text as
-        indicators of its values.  A shape without a value is left out, with a warning.
+        Or a list of names in /subjects: confounders to adjust for (Freedman and Lane 1983).  Text
+        becomes indicators of its values.  Shapes without a value are excluded, with a warning.
     n_components : int, optional
-        As many as hold 90 % of the variance by default, at most half of the number of shapes.
+        By default the components of 90 % of the variance, at most half of the number of shapes.
     n_permutations : int
-        Where fewer are different, each of these is taken once, and p is exact.
+        If there are fewer distinct permutations, each is used once, and p is exact.
     variances : {"equal", "unequal"}
-        Whether shapes are permuted, which is exact where they scatter alike in all groups; or the
-        signs of their residuals are changed, which holds where the groups scatter differently, and
-        takes errors as symmetric.
+        Permute shapes, which assumes homogeneous covariance; or flip signs of the residuals, which
+        allows groups of different covariance and assumes symmetric errors.
     seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
     Dataset
-        ``statistic``, ``p_value``; attributes ``groups`` (sizes), ``components``, ``smallest_p``
-        that the permutations can reach, how many these are, ``covariates`` in words, and the shapes
+        ``statistic``, ``p_value``; attributes ``groups`` (sizes), ``components``, ``permutations``,
+        ``smallest_p`` that these can reach, ``covariates`` in words, and the excluded shapes
         ``left_out``.
 
     Raises
     ------
     ValueError
-        When a group has fewer than 3 shapes, or a covariate is of no use: dates, names of shapes,
+        If a group has fewer than 3 shapes, or a covariate cannot be used: dates, names of shapes,
         numbers mixed with text.
+
+    See Also
+    --------
+    group_map : Where on the surface groups differ.
+    regression : Continuous variables.
+
+    References
+    ----------
+    Freedman, D. and Lane, D. (1983). A nonstochastic interpretation of reported significance
+    levels. Journal of Business and Economic Statistics 1(4).
+    Ledoit, O. and Wolf, M. (2004). A well-conditioned estimator for large-dimensional covariance
+    matrices. Journal of Multivariate Analysis 88(2).
 
     Examples
     --------
-    With the ``study`` of six small brains, split at random:
+    In a study of six small brains, with random groups:
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
@@ -98,11 +110,11 @@ def group_test(
 def compare_groups(
     sample: Sample, options: dict[str, Any], n_components: int | None = None
 ) -> xr.Dataset:
-    """Test groups as :func:`group_test` does, with `options` of a :class:`Model`."""
+    """Test groups of a sample, see :func:`group_test`, with `options` of a :class:`Model`."""
     sizes = group_sizes(sample.values)
     model = Model(indicators(sample.values)[1], sample.Z, **options)
     test = _test_scores(sample, model, n_components)
-    return test.assign_attrs(groups=sizes, **sample.said, **model.said())
+    return test.assign_attrs(groups=sizes, **sample.attributes, **model.attributes())
 
 
 def group_map(
@@ -116,62 +128,72 @@ def group_map(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """Where do groups of shapes differ?  A permutation test at every vertex of the template.
+    """Test where the mean shapes of groups differ, at every vertex of the template.
 
     Parameters
     ----------
     study, group, covariates, n_permutations, variances, seed, rng
         See :func:`group_test`.
     of : {"vector", "normal"}
-        The displacements, or their part along the normals.
+        The displacements, or their normal component.
 
     Returns
     -------
     Dataset
         ``explained_share(vertex)``, ``p_vertex``, ``p_family_wise`` (max-T), ``p_false_discovery``
-        (Benjamini and Hochberg), ``effect(vertex, xyz)`` = mean of the second group minus that of
-        the first, in sorted order, and ``effect_size``: Mahalanobis distance of two groups' means,
-        Cohen's f of several.
+        (Benjamini and Hochberg), ``effect(vertex, xyz)`` = mean of the second group minus mean of
+        the first, in sorted order, and ``effect_size``: Mahalanobis distance between the means of
+        two groups, Cohen's f of several.
 
     Raises
     ------
     ValueError
-        When a group has fewer than 3 shapes.
+        If a group has fewer than 3 shapes.
+
+    See Also
+    --------
+    group_test : One test for the whole shape.
+
+    References
+    ----------
+    Westfall, P. H. and Young, S. S. (1993). Resampling-based multiple testing. Wiley.
+    Benjamini, Y. and Hochberg, Y. (1995). Controlling the false discovery rate. Journal of the
+    Royal Statistical Society B 57(1).
 
     Examples
     --------
-    With the ``study`` of six small brains, split at random:
+    In a study of six small brains, with random groups:
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
-    >>> where = s4a.statistics.group_map(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
-    >>> where["effect"].dims, bool((where["p_family_wise"] > 0.05).all())
+    >>> result = s4a.statistics.group_map(study, ["a", "a", "a", "b", "b", "b"], n_permutations=99)
+    >>> result["effect"].dims, bool((result["p_family_wise"] > 0.05).all())
     (('vertex', 'xyz'), True)
 
-    How far the second group is larger, along the normals:
+    The normal component of the effect:
 
     >>> mean = s4a.synthesize(study, [0.0])
     >>> X, T = s4a.geometry.mesh.as_arrays(mean)
-    >>> along = (where["effect"].values * s4a.geometry.mesh.vertex_normals(X, T)).sum(1)
-    >>> s4a.show.charts.surfaces({"b minus a": mean}, {"b minus a": along}, label="mm")
-    <Parts ...>
+    >>> normal = (result["effect"].values * s4a.geometry.mesh.vertex_normals(X, T)).sum(1)
+    >>> s4a.show.charts.surfaces({"b minus a": mean}, {"b minus a": normal}, label="mm")
+    <TiledFigure ...>
     """
     options = check_options(n_permutations, variances, seed_of(seed, rng))
     return map_groups(sample_of(study, group, "group", covariates), options, of)
 
 
 def map_groups(sample: Sample, options: dict[str, Any], of: str = "vector") -> xr.Dataset:
-    """Test groups at every vertex as :func:`group_map` does, with `options` of a :class:`Model`."""
+    """Test groups of a sample at every vertex, see :func:`group_map`."""
     sizes = group_sizes(sample.values)
     names, x = indicators(sample.values)
     model = Model(x, sample.Z, **options)
     effect_map = _test_vertices(sample, model, of)
     squared = squared_cohen_f(effect_map["explained_share"].values)
-    if len(names) == 2:  # Mahalanobis distance of the means: T^2 (1 / n_1 + 1 / n_2)
+    if len(names) == 2:  # squared Mahalanobis distance of the means: T^2 (1 / n_1 + 1 / n_2)
         dof = len(x) - sum(basis.shape[1] for basis in model.bases)
         squared = squared * dof * (1 / np.unique(sample.values, return_counts=True)[1]).sum()
     return effect_map.merge(dataset(effect_size=np.sqrt(squared))).assign_attrs(
-        groups=sizes, of=of, **sample.said, **model.said()
+        groups=sizes, of=of, **sample.attributes, **model.attributes()
     )
 
 
@@ -187,7 +209,7 @@ def regression(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """How does shape change with a continuous variable, such as age?
+    """Regress shape on a continuous variable, such as age, and test the effect.
 
     Parameters
     ----------
@@ -200,21 +222,26 @@ def regression(
     Returns
     -------
     Dataset
-        The global test, ``statistic`` and ``p_value``, as of :func:`group_test`; the test at every
-        vertex as of :func:`group_map`, ``effect(vertex, xyz)`` per unit of the variable,
+        The global test, ``statistic`` and ``p_value``, see :func:`group_test`; the test at every
+        vertex, see :func:`group_map`; ``effect(vertex, xyz)`` per unit of the variable,
         ``effect_size`` = Cohen's f, and ``intercept(vertex, xyz)``; ``standard_score(shape)`` of
         the variable.  Attributes ``mean``,
-        ``standard_deviation``, ``lowest`` and ``highest`` of the variable, ``freed_deviation`` of
-        what the covariates leave of it, and those of :func:`group_test`.
+        ``standard_deviation``, ``lowest`` and ``highest`` of the variable, ``freed_deviation``, its
+        standard deviation adjusted for the covariates, and those of :func:`group_test`.
 
     Raises
     ------
     ValueError
-        When the variable is text, constant, infinite, or a combination of the covariates.
+        If the variable is text, constant, infinite, or a combination of the covariates.
+
+    See Also
+    --------
+    predict : Shape at a value of the variable.
+    regression_modes : The regression as a mode of variation.
 
     Examples
     --------
-    With the ``study`` of six small brains; the score of the first mode itself is what it follows:
+    In a study of six small brains, with the first score as variable:
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
@@ -232,7 +259,7 @@ def regression(
 def regress(
     sample: Sample, options: dict[str, Any], n_components: int | None = None, of: str = "vector"
 ) -> xr.Dataset:
-    """Regress as :func:`regression` does, with `options` of a :class:`Model`."""
+    """Regress a sample, see :func:`regression`, with `options` of a :class:`Model`."""
     x = numbers_of(sample.values)
     model = Model(x, sample.Z, **options)
     test = _test_scores(sample, model, n_components)
@@ -254,63 +281,64 @@ def regress(
             standard_deviation=deviation,
             freed_deviation=freed_deviation(x, sample.Z),
             components=test.attrs["components"],
-            **sample.said,
-            **model.said(),
+            **sample.attributes,
+            **model.attributes(),
         )
     )
 
 
 def freed_deviation(x: np.ndarray, Z: np.ndarray | None) -> float:
-    """The standard deviation of what covariates ``(s, c)`` leave of a variable ``(s,)``."""
+    """Return the standard deviation of a variable ``(s,)`` adjusted for covariates ``(s, c)``."""
     if Z is None:
         return float(x.std(ddof=1))
-    left = x - x.mean()
+    residual = x - x.mean()
     columns = standardize(Z)[0]
-    left = left - columns @ np.linalg.lstsq(columns, left, rcond=None)[0]
-    return float(np.sqrt(left @ left / (len(x) - 1)))
+    residual = residual - columns @ np.linalg.lstsq(columns, residual, rcond=None)[0]
+    return float(np.sqrt(residual @ residual / (len(x) - 1)))
 
 
 def numbers_of(values: np.ndarray, what: str = "variable") -> np.ndarray:
-    """The variable of a regression as floats ``(s,)``; ValueError says what else to do."""
+    """Return the variable of a regression as floats ``(s,)`` after a check."""
     if values.dtype.kind == "U":
         raise ValueError(
-            f"a regression needs a {what} of numbers, found text such as {str(values[0])!r}; a "
-            "group test takes text"
+            f"a regression needs a {what} of numbers; found text such as {str(values[0])!r}: use a "
+            "group test for text"
         )
     if values.ndim > 1:
-        raise ValueError(f"a regression needs one number for each shape, found {values.shape}")
+        raise ValueError(f"a regression needs one number for each shape; found {values.shape}")
     x = values.astype(float)
     if not 1e-30 < abs(x).max() < 1e30 and x.any():
         raise ValueError(
-            f"a regression needs a {what} of a size between 1e-30 and 1e30, found {x.max():.3g}; "
-            "give it in another unit"
+            f"a regression needs a {what} between 1e-30 and 1e30; found {x.max():.3g}: give it in "
+            "another unit"
         )
     return x
 
 
 def predict(study: xr.DataTree, fit: xr.Dataset, value: float) -> xr.Dataset:
-    """The shape at a value of the variable of a :func:`regression`.
-
-    :func:`regression_modes` animates it.
+    """Predict the shape at a value of the variable of a :func:`regression`.
 
     Parameters
     ----------
     study : DataTree
-        That of the regression.
+        The study of the regression.
     fit : Dataset
-        As :func:`regression` gives it.
+        Result of :func:`regression`.
     value : float
-        Of the variable, in its unit.
+        Value of the variable, in its unit.
 
     Returns
     -------
     Dataset
         ``position(vertex, xyz)`` and ``corner_vertex``.
 
+    See Also
+    --------
+    regression_modes : An animation of these shapes.
+
     Examples
     --------
-    With the ``study`` of six small brains; from an age of 0 to 5 a shape moves by five times the
-    effect:
+    In a study of six small brains, from age 0 to 5 a shape moves by five times the effect:
 
     >>> import numpy as np
     >>> import s4a
@@ -321,7 +349,7 @@ def predict(study: xr.DataTree, fit: xr.Dataset, value: float) -> xr.Dataset:
     True
     >>> shapes = {f"age {age}": s4a.statistics.predict(study, fit, age) for age in (-5, 2.5, 10)}
     >>> s4a.show.charts.surfaces(shapes)
-    <Parts ...>
+    <TiledFigure ...>
     """
     check_moves(fit)
     template = study["registration"].to_dataset()
@@ -333,31 +361,34 @@ def predict(study: xr.DataTree, fit: xr.Dataset, value: float) -> xr.Dataset:
 
 
 def regression_modes(study: xr.DataTree, fit: xr.Dataset, name: str = "variable") -> xr.DataTree:
-    """A :func:`regression` in the form of a study with one mode, for everything that shows modes.
+    """Convert a :func:`regression` to a study with one mode of variation, to show it.
 
-    ``s4a.explore`` and the panel of the modes play it with a slider, :func:`s4a.write_page` and
-    :func:`s4a.write_film` make it a file; one standard deviation of the mode is
-    one of the variable.
+    ``s4a.explore`` shows it with a slider, :func:`s4a.write_page` and :func:`s4a.write_film` write
+    it to a file.  One standard deviation of the mode is one standard deviation of the variable.
 
     Parameters
     ----------
     study : DataTree
     fit : Dataset
-        Of :func:`regression`.
+        Result of :func:`regression`.
     name : str
-        Of the variable.
+        Name of the variable.
 
     Returns
     -------
     DataTree
         ``/registration`` and ``/coarse`` of the study, and ``/pca`` with one component:
-        ``deformation`` by the effect of one standard deviation, ``score`` the variable of each
-        shape, ``explained_variance_ratio`` the share of the variance of the displacements that it
-        explains.
+        ``deformation`` is the effect of one standard deviation, ``score`` the standardised variable
+        of each shape, ``explained_variance_ratio`` the explained share of the variance of the
+        displacements.
+
+    See Also
+    --------
+    predict : The shape at one value.
 
     Examples
     --------
-    With the ``study`` of six small brains:
+    In a study of six small brains:
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
@@ -370,9 +401,9 @@ def regression_modes(study: xr.DataTree, fit: xr.Dataset, name: str = "variable"
     d = d[registration["shape"].isin(fit["shape"]).values]
     step = fit["effect"].values * fit.attrs["standard_deviation"]  # (n, 3)
     size = np.sqrt(np.einsum("nx,nx,n->", step, step, area))
-    # the slope explains what varies with the part of the variable that covariates leave
-    free = fit.attrs.get("freed_deviation", fit.attrs["standard_deviation"])
-    explained = size * free / fit.attrs["standard_deviation"]
+    # the slope explains variation with the adjusted variable
+    adjusted = fit.attrs.get("freed_deviation", fit.attrs["standard_deviation"])
+    explained = size * adjusted / fit.attrs["standard_deviation"]
     total = gram(d - d.mean(0), area).trace() / (len(d) - 1)
     return modes_study(
         study,
@@ -395,19 +426,19 @@ def modes_study(
     mean: np.ndarray | None = None,
     **modes: np.ndarray,
 ) -> xr.DataTree:
-    """A study of these shapes whose ``/pca`` are other modes than its own, for what shows modes.
+    """Return a study of some shapes with given modes in ``/pca``, to show them.
 
     Parameters
     ----------
     study : DataTree
     shapes : DataArray (shape,)
     name : str
-        Of the modes.
+        Name of the modes.
     deformation : float ndarray (component, vertex, xyz)
     mean : float ndarray (vertex, xyz), optional
-        That of the displacements by default.
+        Mean displacement; by default computed.
     **modes : float ndarray
-        The other variables of ``/pca``.
+        Other variables of ``/pca``.
     """
     registration = registration_of(study)
     registration = registration.isel(shape=registration["shape"].isin(shapes).values)
@@ -429,7 +460,7 @@ def modes_study(
     return xr.DataTree.from_dict(nodes, name=study.name)
 
 
-# what several of them share
+# shared functions
 
 
 def check_moves(fit: xr.Dataset) -> None:
@@ -437,13 +468,13 @@ def check_moves(fit: xr.Dataset) -> None:
     check_type(fit, xr.Dataset, "fit", "a Dataset, such as s4a.statistics.regression returns")
     if "effect" not in fit:
         raise ValueError(
-            f"a regression of displacements needed, found {', '.join(map(str, fit)) or 'nothing'}; "
-            "a field moves no vertex: show its field_effect as colours"
+            "a regression of displacements is needed; found "
+            f"{', '.join(map(str, fit)) or 'nothing'}: show the field_effect of a field as colours"
         )
 
 
 def scores_of(sample: Sample, n_components: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Scores on the first components ``(s, c)``, and all coordinates in the unit of the input."""
+    """Return standardised scores ``(s, c)``, and all scores in the unit of the input."""
     d = sample.d
     variance, V = principal_components(gram(d - d.mean(0), sample.area))
     if not len(variance):
@@ -454,7 +485,7 @@ def scores_of(sample: Sample, n_components: int | None) -> tuple[np.ndarray, np.
 
 
 def _test_scores(sample, model, n_components):
-    """One test for the whole shape: Hotelling's T^2 of the scores on x, Z accounted for."""
+    """Test of the whole shape: Hotelling's T^2 of the scores on x, adjusted for Z."""
     scores, coordinates = scores_of(sample, n_components)
     statistic, p = model.test(scores)
     if model.variances == "equal":
@@ -463,40 +494,40 @@ def _test_scores(sample, model, n_components):
 
 
 def _report_unequal_variances(coordinates, x, sample):
-    """Say where shapes scatter differently between the groups, or with the variable."""
+    """Warn if the covariance differs between groups or with the variable."""
     distance, p = scatter_test(coordinates, x, covariates=sample.Z)
     if p >= UNEQUAL:
         return
-    where = "with the variable"
-    which = "too small or too large"
+    details = "with the variable"
+    bias = "too small or too large"
     groups = np.unique(sample.values)
     if len(groups) == len(np.unique(x, axis=0)) and len(groups) < len(x) / 2:
-        where = ", ".join(
+        details = ", ".join(
             f"{group}: {np.sqrt((distance[sample.values == group] ** 2).mean()):.3g} {sample.unit}"
             for group in groups
         )
-        which = "too small where a small group scatters more, too large where a large one does"
+        bias = "too small if a small group varies more, too large if a large one does"
     log.warning(
-        "the shapes scatter differently (%s; p = %.2g), but p values take variances as equal and "
-        "are %s: variances='unequal' (--variances unequal) does without that",
-        where,
+        "the variance differs (%s; p = %.2g), but p values assume equal variances and are %s: "
+        "use variances='unequal' (--variances unequal)",
+        details,
         p,
-        which,
+        bias,
     )
 
 
 def fields_to_test(d: np.ndarray, registration: xr.Dataset, of: str) -> np.ndarray:
-    """Fields ``(s, n, k)`` of a test at every vertex: vectors, or their part along the normals."""
+    """Return the fields ``(s, n, k)`` of a test at every vertex: vectors or normal components."""
     if of not in ("vector", "normal"):
-        raise ValueError(f"of must be 'vector' or 'normal', found {of!r}")
+        raise ValueError(f"of must be 'vector' or 'normal'; found {of!r}")
     if of == "vector":
         return d
     return normal_displacement(d, vertex_normals(*as_arrays(registration)))[..., None]
 
 
-def vertex_results(found: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-    """What a test at every vertex found, by the names of its variables."""
-    share, p, p_max = found
+def vertex_results(test: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the variables of a test at every vertex by name."""
+    share, p, p_max = test
     return {
         "explained_share": share,
         "p_vertex": p,
@@ -506,19 +537,19 @@ def vertex_results(found: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str
 
 
 def _test_vertices(sample, model, of):
-    """A test at every vertex, and the effect of the first column of x on the displacement."""
+    """Test at every vertex, with the effect of the first column of x on the displacement."""
     d, k = sample.d, sample.d.shape[2]
-    found = model.vertex_test(fields_to_test(d, sample.registration, of))
+    test = model.vertex_test(fields_to_test(d, sample.registration, of))
     columns = np.column_stack([np.ones(len(d)), model.rows])
-    columns[:, 1:] -= columns[:, 1:].mean(0)  # so that the intercept is where x is at its mean
+    columns[:, 1:] -= columns[:, 1:].mean(0)  # so that the intercept is at the mean of x
     size = np.linalg.norm(columns, axis=0)
     size[size == 0] = 1
     B = np.linalg.pinv(columns / size, rcond=1e-10) @ d.reshape(len(d), -1).astype(float)
     intercept, slope = (B / size[:, None])[:2].reshape(2, -1, k)
-    result = dataset(None, **vertex_results(found), effect=slope, intercept=intercept)
+    result = dataset(None, **vertex_results(test), effect=slope, intercept=intercept)
     return in_unit(result, sample.unit)
 
 
 def squared_cohen_f(share: np.ndarray) -> np.ndarray:
-    """Cohen's f^2 at every vertex ``(n,)``: what is explained over what is not."""
+    """Return Cohen's f^2 at every vertex ``(n,)``: explained over unexplained variance."""
     return share / np.maximum(1 - share, 1e-12)

@@ -1,4 +1,4 @@
-"""Registered collections for other programs (4.3, 6.1, 6.2): meshes and tables."""
+"""Export of registered collections to other programs (4.3, 6.1, 6.2): meshes and tables."""
 
 import csv
 from collections.abc import Iterable
@@ -19,20 +19,20 @@ FORMATS = {"ply": ".ply", "vtk": ".vtk", "obj": ".obj", "npz": ".npz", "gifti": 
 
 
 def write_table(path: Path, head: Iterable[Any], rows: Iterable[Any]) -> Path:
-    """Write a CSV; gives its path."""
+    """Write a CSV file and return its path."""
     with open(path, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([list(head), *rows])
     return path
 
 
 def write_dataset(data: xr.Dataset | xr.DataTree, path: Path) -> Path:
-    """Write a Dataset or tree as a netCDF file, at once and with checksums; gives its path."""
+    """Write a Dataset or tree to a netCDF file with checksums, atomically; return its path."""
     store.write(data, path)
     return path
 
 
 def write_scores(pca: xr.Dataset, path: Path) -> Path:
-    """Write the scores as CSV, a row per shape, in standard deviations; gives its path."""
+    """Write scores to a CSV file, a row per shape, in standard deviations; return its path."""
     columns = (f"component_{c + 1}" for c in range(pca.sizes["component"]))
     rows = zip(pca["shape"].values.tolist(), pca["score"].values.tolist(), strict=True)
     return write_table(path, ["shape", *columns], ([name, *row] for name, row in rows))
@@ -46,23 +46,23 @@ def write_registered(
     frame: str = "template",
     n_modes: int = 3,
 ) -> list[Path]:
-    """Write every shape with the template's triangles, and the scores and modes.
+    """Write every shape in the triangulation of the template, with scores and modes.
 
-    Vertex i is the same place on every shape, as ShapeWorks, Scalismo and geomorph want it.
+    Vertex i is the same point on every shape, as ShapeWorks, Scalismo and geomorph require.
 
     Parameters
     ----------
     study : DataTree
-        With ``/registration``; without ``/pca`` no scores and modes are written.
+        With ``/registration``; scores and modes are written if it has ``/pca``.
     folder : path
-        Made where it is missing.
+        Created if missing.
     format : {"ply", "vtk", "obj", "npz", "gifti"}
-        All but OBJ hold the ``confidence`` of every vertex too.
+        All but OBJ include the ``confidence`` of every vertex.
     frame : {"template", "shape"}
-        Aligned to the template, or where each shape lies in its file, mirrored back where the run
-        mirrored it; the unit is that of the input.
+        Aligned to the template, or in the coordinates of each shape's file, with mirrored shapes
+        reflected back; the unit is that of the input.
     n_modes : int
-        Modes written as CSV; the netCDF file has all.
+        Number of modes in CSV files; the netCDF file has all.
 
     Returns
     -------
@@ -75,12 +75,16 @@ def write_registered(
     Raises
     ------
     ValueError
-        When the study is not registered, a shape is named ``template``, or an option is not one of
-        those above.
+        If the study is not registered, a shape is named ``template``, or an option is unknown.
+
+    See Also
+    --------
+    s4a.write_mesh : Write one mesh.
+    s4a.write_label_volumes : Write labels as volumes.
 
     Examples
     --------
-    With the ``study`` of six small brains:
+    In a study of six small brains:
 
     >>> import tempfile
     >>> import s4a
@@ -90,20 +94,20 @@ def write_registered(
     ['brain_06.ply', 'template.ply', 'scores.csv']
     """
     if format not in FORMATS or frame not in ("template", "shape"):
-        legal = ", ".join(FORMATS)
         raise ValueError(
-            f"format must be one of {legal}, frame template or shape; found {format!r}, {frame!r}"
+            f"format must be one of {', '.join(FORMATS)}, frame template or shape; found "
+            f"{format!r}, {frame!r}"
         )
     registration = registration_of(study)
     names = registration["shape"].values.tolist()
     if "template" in names:
         raise ValueError(
-            "shapes need names other than 'template', which is the file of the template's mesh"
+            "no shape may be named 'template', which is the file name of the template: rename it"
         )
     if frame == "shape" and "rotation" not in registration:
         raise ValueError(
-            "frame='shape' needs the transform of every shape, and this study has none: write in "
-            "the frame of the template"
+            "frame='shape' needs the transform of every shape; this study has none: use "
+            "frame='template'"
         )
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -111,15 +115,14 @@ def write_registered(
     X, T = as_arrays(registration)
     paths = []
     for name in names:
-        own = registration.sel(shape=name)
-        in_template = X + own["displacement"].values
-        points, triangles = in_template, T
+        registered = registration.sel(shape=name)
+        points, triangles = X + registered["displacement"].values, T
         if frame == "shape":
-            points = image_in_shape(X, own)
+            points = image_in_shape(X, registered)
             if is_reflected(study, name):
                 points, triangles = points * MIRROR, T[:, ::-1]
-        has_scalars = format != "obj" and "confidence" in own
-        scalars = {"confidence": own["confidence"].values} if has_scalars else {}
+        has_scalars = format != "obj" and "confidence" in registered
+        scalars = {"confidence": registered["confidence"].values} if has_scalars else {}
         paths.append(folder / f"{name}{suffix}")
         write_mesh(paths[-1], points, triangles, **scalars)
     paths.append(folder / f"template{suffix}")
@@ -130,18 +133,18 @@ def write_registered(
 
 
 def is_reflected(study: xr.DataTree, name: str) -> bool:
-    """Whether the run took the mirror image of a shape."""
+    """Return whether the run mirrored a shape."""
     if "original" in study.children:
         meshes = study["original"].children
         return name in meshes and bool(meshes[name].attrs.get("reflected"))
     report = study["report"].to_dataset() if "report" in study.children else xr.Dataset()
-    if "reflected" not in report:  # the study of a part of what varies has its report alone
+    if "reflected" not in report:  # as in restricted studies
         return False
     return bool(report["reflected"].sel(shape=name))
 
 
 def _write_modes(pca, folder, n_modes):
-    """The tables of scores, components and the first modes, and all modes as netCDF."""
+    """Write tables of scores, components and the first modes, and all modes as netCDF."""
     components = range(1, pca.sizes["component"] + 1)
     measures = ["standard_deviation", "explained_variance_ratio"]
     columns = (pca[name].values.tolist() for name in measures)
@@ -160,21 +163,20 @@ def _write_modes(pca, folder, n_modes):
 
 
 def write_results(result: xr.Dataset, folder: Path | str, name: str) -> list[Path]:
-    """Write a Dataset of :mod:`s4a.analysis.statistics` as netCDF, and its columns as CSV.
+    """Write a result of :mod:`s4a.analysis.statistics` to netCDF, and its columns to CSV files.
 
     Parameters
     ----------
     result : Dataset
     folder : path
-        Made where it is missing.
+        Created if missing.
     name : str
 
     Returns
     -------
     list of Path
-        ``<name>.nc`` with everything; ``<name>.<dim>.csv``, a row per shape, component, fold or
-        vertex and a column per variable over this dim alone, and ``<name>.csv`` with the numbers
-        that have none.
+        ``<name>.nc`` with all variables; ``<name>.<dim>.csv``, with a row per shape, component,
+        fold or vertex and a column per variable of this dim only; ``<name>.csv`` with the scalars.
 
     Examples
     --------
@@ -204,7 +206,7 @@ def write_results(result: xr.Dataset, folder: Path | str, name: str) -> list[Pat
 
 
 def _index_of(result, dim):
-    """Names along a dim, or numbers: components count from 1, all else from 0."""
+    """Names along a dim, or numbers: components from 1, others from 0."""
     if dim in result.coords:
         return result[dim].values.tolist()
     start = int(dim == "component")

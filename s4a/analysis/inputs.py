@@ -1,4 +1,4 @@
-"""What an analysis takes of a study (6.1): its registration, and one value per shape."""
+"""Inputs of statistics (6.1): the registration of a study, and one value per shape."""
 
 import logging
 import re
@@ -24,20 +24,20 @@ from s4a.study.tree import left_out
 
 log = logging.getLogger(__name__)
 
-# One value per shape: in the order of the study; by name of the shape, in a dict, a pandas object
-# with an index or a DataArray with the coordinate shape; or a column of /subjects.
+# One value per shape: in the order of the study; by name of the shape in a dict, a pandas object or
+# a DataArray with the coordinate shape; or the name of a column of /subjects.
 Values = np.ndarray | Sequence[Any] | dict[str, Any] | str
 
 DATE = re.compile(r"\d{4}-\d\d?-\d\d?.*|\d{4}/\d\d?/\d\d?|\d\d?[./-]\d\d?[./-](\d\d){1,2}")
-IDENTIFIER = re.compile(r"(\b|_)(id|nr|code)'?$", re.IGNORECASE)  # how names of columns end
+IDENTIFIER = re.compile(r"(\b|_)(id|nr|code)'?$", re.IGNORECASE)  # end of a column's name
 
 
 class Sample(NamedTuple):
-    """The shapes of a test, those with all values, and what the test needs to know of them.
+    """The data of a test, for the shapes with all values.
 
-    ``registration``, ``d (s, n, 3)`` and ``area (n,)`` as of :func:`displacements_of`;
-    ``values (s,)`` are tested, ``Z (s, c)`` is accounted for, or None; ``said`` are attributes of a
-    result: the covariates in words, and which shapes are left out; ``unit`` is that of d.
+    ``registration``, ``d (s, n, 3)`` and ``area (n,)`` of :func:`displacements_of`; the tested
+    ``values (s,)``; the covariates ``Z (s, c)`` or None; ``attributes`` of a result: the covariates
+    in words, and the excluded shapes; ``unit`` of d.
     """
 
     registration: xr.Dataset
@@ -45,7 +45,7 @@ class Sample(NamedTuple):
     area: np.ndarray
     values: np.ndarray
     Z: np.ndarray | None
-    said: dict[str, str]
+    attributes: dict[str, str]
     unit: str
 
 
@@ -56,46 +56,48 @@ def sample_of(
     covariates: Values | dict[str, Values] | list[str] | None = None,
     needed: dict[str, np.ndarray] | None = None,
 ) -> Sample:
-    """The shapes that have all values; those that lack one are left out, with a warning.
+    """Return the data of the shapes with all values; others are excluded, with a warning.
 
-    A shape must also have the values ``(s,)`` of `needed`, by what they are, which are not used.
+    Shapes also need the values ``(s,)`` of `needed`, a dict by name, which are not used otherwise.
 
     Raises
     ------
     ValueError
-        When values are of no use for a test; it says which, why, and what to do.
+        If values cannot be used in a test.
     """
     registration, d, area = displacements_of(study)
     tested = f"{what} {values!r}" if isinstance(values, str) else what
     columns = {tested: values_of(study, values, what)}
     columns |= covariates_of(study, covariates)
     names = registration["shape"].values
-    unknown = {column: is_unknown(of) for column, of in (columns | (needed or {})).items()}
-    for column, of in unknown.items():
-        if of.any():
+    missing = {column: lacks_value(data) for column, data in (columns | (needed or {})).items()}
+    for column, lacking in missing.items():
+        if lacking.any():
             log.warning(
-                "%s has no value for %d of %d shapes, which are left out of the test: %s",
+                "%s has no value for %d of %d shapes, which are excluded from the test: %s",
                 column,
-                of.sum(),
-                len(of),
-                listed(names[of].tolist()),
+                lacking.sum(),
+                len(names),
+                listed(names[lacking].tolist()),
             )
-    known = ~np.any(list(unknown.values()), axis=0)
-    if known.sum() < 4:
+    complete = ~np.any(list(missing.values()), axis=0)
+    if complete.sum() < 4:
         raise ValueError(
-            f"a test needs at least 4 shapes with all values, found {known.sum()} of {len(known)}"
+            "a test needs at least 4 shapes with all values; found "
+            f"{complete.sum()} of {len(complete)}"
         )
-    said = {"left_out": ", ".join([*left_out(study), *names[~known]])}
-    if not known.all():
-        registration, d = registration.isel(shape=known), d[known]
-    of_tested = columns.pop(tested)[known]
-    Z, said["covariates"] = columns_of({name: of[known] for name, of in columns.items()})
+    attributes = {"left_out": ", ".join([*left_out(study), *names[~complete]])}
+    if not complete.all():
+        registration, d = registration.isel(shape=complete), d[complete]
+    columns = {name: data[complete] for name, data in columns.items()}
+    tested_values = columns.pop(tested)
+    Z, attributes["covariates"] = columns_of(columns)
     unit = unit_of(registration["displacement"])
-    return Sample(registration, d, area, of_tested, Z, said, unit)
+    return Sample(registration, d, area, tested_values, Z, attributes, unit)
 
 
 def all_registered(study: xr.DataTree) -> xr.Dataset:
-    """``/registration`` of a study, flagged shapes too; ValueError where it has none."""
+    """Return ``/registration`` of a study, with flagged shapes."""
     check_type(study, xr.DataTree)
     if "registration" not in study:
         raise ValueError(
@@ -105,14 +107,12 @@ def all_registered(study: xr.DataTree) -> xr.Dataset:
 
 
 def registration_of(study: xr.DataTree) -> xr.Dataset:
-    """``/registration`` of the shapes that enter modes and statistics.
-
-    Those are all but the flagged ones, see :func:`with_flagged`.
+    """Return ``/registration`` of a study without flagged shapes, see :func:`with_flagged`.
 
     Raises
     ------
     ValueError
-        When the study has none.
+        If the study has no registration.
     """
     registration = all_registered(study)
     flagged = left_out(study)
@@ -123,9 +123,9 @@ def registration_of(study: xr.DataTree) -> xr.Dataset:
 
 
 def with_flagged(study: xr.DataTree) -> xr.DataTree:
-    """A study whose flagged shapes enter modes and statistics; the study given stays as it is.
+    """Return a study that includes its flagged shapes in modes and statistics.
 
-    What ``include_flagged=True`` of :func:`s4a.analyse` makes, without another run.
+    The same as ``include_flagged=True`` of :func:`s4a.analyse`, without another run.
 
     Parameters
     ----------
@@ -140,11 +140,15 @@ def with_flagged(study: xr.DataTree) -> xr.DataTree:
     Raises
     ------
     ValueError
-        When the study is not registered, or its shapes have no modes.
+        If the study is not registered, or PCA of its shapes is impossible.
+
+    See Also
+    --------
+    outliers : Detect outliers in the finished study.
 
     Examples
     --------
-    With the ``study`` of six small brains, none of which is flagged:
+    In a study of six small brains without flagged shapes:
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
@@ -168,31 +172,31 @@ def with_flagged(study: xr.DataTree) -> xr.DataTree:
 
 
 def displacements_of(study: xr.DataTree) -> tuple[xr.Dataset, np.ndarray, np.ndarray]:
-    """:func:`registration_of`, its displacements ``(s, n, 3)``, and vertex areas of sum 1 ``(n,)``.
+    """Return registration, displacements ``(s, n, 3)``, and vertex areas of sum 1 ``(n,)``.
 
-    The log names the shapes that are left out as flagged.
+    Flagged shapes are excluded, with a warning.
 
     Raises
     ------
     ValueError
-        When there are fewer than 4 shapes, all are equal, or a displacement is not finite.
+        If there are fewer than 4 shapes, or displacements are not finite or all equal.
     """
     registration = registration_of(study)
     require(registration, "displacement", "position", "corner_vertex", what="registration")
     flagged = left_out(study)
     if flagged:
-        log.warning("flagged and left out: %s; see with_flagged", ", ".join(flagged))
+        log.warning("flagged and excluded: %s; see with_flagged", ", ".join(flagged))
     if registration.sizes["shape"] < 4:
         more = f", and {len(flagged)} flagged: {', '.join(flagged)}" if flagged else ""
         raise ValueError(
-            f"statistics need at least 4 shapes, found {registration.sizes['shape']}{more}"
+            f"statistics need at least 4 shapes; found {registration.sizes['shape']}{more}"
         )
     area = vertex_areas(*as_arrays(registration))
     d = registration["displacement"].transpose("shape", "vertex", "xyz").values
     is_finite = np.isfinite(d).all(axis=(1, 2))
     if not is_finite.all():
         raise ValueError(
-            "statistics need finite displacements; leave out of the study, or register again: "
+            "statistics need finite displacements; exclude or register again: "
             f"{listed(registration['shape'].values[~is_finite].tolist())}"
         )
     if abs(d - d[0]).max() < 1e-9 * abs(registration["position"].values).max():
@@ -201,32 +205,32 @@ def displacements_of(study: xr.DataTree) -> tuple[xr.Dataset, np.ndarray, np.nda
 
 
 def values_of(study: xr.DataTree, values: Values, what: str) -> np.ndarray:
-    """One value per shape, or one row, in the order of the study; `what` they are, for errors.
+    """Return one value or row per shape in the order of the study; errors call them `what`.
 
     Returns
     -------
     ndarray (s,) or (s, c)
-        Numbers, NaN where one is missing; or text, empty where one is missing.
+        Numbers, or text; missing values are NaN or empty.
     """
     names = registration_of(study)["shape"].values.tolist()
     if isinstance(values, str):
         what = f"{what} {values!r}"
         values = _column(study, values, what)
     values = np.asarray(_in_order(values, names, what))
-    everyone = all_registered(study)["shape"].values.tolist()
-    if values.ndim and len(values) == len(everyone):  # those that are left out may have one too
-        values = values[[everyone.index(name) for name in names]]
+    registered = all_registered(study)["shape"].values.tolist()
+    if values.ndim and len(values) == len(registered):  # excluded shapes may have values
+        values = values[[registered.index(name) for name in names]]
     if values.ndim not in (1, 2) or len(values) != len(names):
         raise ValueError(
-            f"{what} needs one value for each of {len(names)} shapes, found shape {values.shape}"
+            f"{what} needs one value for each of {len(names)} shapes; found shape {values.shape}"
         )
     return _plain(values, names, what)
 
 
 def _in_order(values, names, what):
-    """Values in the order of the shapes, where keys or an index have their names.
+    """Values in the order of the shapes, if keys or an index are names of shapes.
 
-    A pandas index of numbers is none of names, unless all shapes are called by numbers.
+    A numeric pandas index is ignored, unless all shapes have numbers as names.
     """
     rows = values
     if isinstance(values, dict):
@@ -240,29 +244,31 @@ def _in_order(values, names, what):
             return values
     else:
         return values
-    words = list(map(str, labels))
-    missing = [name for name in names if name not in words]
+    labels = list(map(str, labels))
+    missing = [name for name in names if name not in labels]
     if missing:
         raise ValueError(f"{what} needs a value for every shape; it lacks {listed(missing)}")
-    twice = [name for name in names if words.count(name) > 1]
-    if twice:
-        raise ValueError(f"{what} needs one value for every shape; it has more of {listed(twice)}")
-    return [rows[words.index(name)] for name in names]
+    repeated = [name for name in names if labels.count(name) > 1]
+    if repeated:
+        raise ValueError(
+            f"{what} needs one value for every shape; it has several for {listed(repeated)}"
+        )
+    return [rows[labels.index(name)] for name in names]
 
 
 def _plain(values, names, what):
-    """Numbers that are finite or NaN, or text, of whatever the user gave."""
+    """Convert values to numbers, finite or NaN, or text."""
     if values.dtype.kind == "O":
-        gaps = np.array([_is_gap(value) for value in values.ravel()]).reshape(values.shape)
-        kinds = {np.asarray(value).dtype.kind for value in values[~gaps].tolist()}
+        missing = np.array([_is_none(value) for value in values.ravel()]).reshape(values.shape)
+        kinds = {np.asarray(value).dtype.kind for value in values[~missing].tolist()}
         if kinds <= set("iufb"):
-            values = np.where(gaps, np.nan, values).astype(float)
+            values = np.where(missing, np.nan, values).astype(float)
         elif kinds <= set("US"):
-            values = np.where(gaps, "", values).astype(str)
+            values = np.where(missing, "", values).astype(str)
     if values.dtype.kind not in "iufbUS":
         raise ValueError(
-            f"{what} needs numbers alone or text alone, found {_kind(values)}; a date can be given "
-            "as a number, such as years since the first"
+            f"{what} needs only numbers or only text; found {_kind(values)}: give a date as a "
+            "number, such as years since the first"
         )
     if values.dtype.kind in "US":
         cells = [cell.strip() for cell in values.astype(str).ravel().tolist()]
@@ -271,7 +277,7 @@ def _plain(values, names, what):
         if odd:
             raise ValueError(f"{what} {non_numeric_text(odd, names, cells)}")
         if len(cells) != len(names):
-            raise ValueError(f"{what} needs numbers where it has several columns; found text")
+            raise ValueError(f"{what} with several columns needs numbers; found text")
     elif np.isinf(values).any():
         infinite = np.isinf(values).reshape(len(names), -1).any(axis=1)
         raise ValueError(
@@ -281,8 +287,8 @@ def _plain(values, names, what):
     return values
 
 
-def _is_gap(value):
-    """Whether one of several objects stands for no value: None, NaN, pandas' NA, or text."""
+def _is_none(value):
+    """Whether an object is a missing value: None, NaN, NA of pandas, or text."""
     return value is None or str(value) in ("nan", "<NA>", "NaT") or is_missing(str(value))
 
 
@@ -301,21 +307,20 @@ def _column(study, name, what):
             f"{', '.join(map(str, table.data_vars)) or 'none'}; "
             "give a table, or the values themselves"
         )
-    everyone = all_registered(study)["shape"].values.tolist()
-    known = dict(zip(table["shape"].values.tolist(), table[name].values.tolist(), strict=True))
-    return {shape: known.get(shape) for shape in everyone}
+    rows = dict(zip(table["shape"].values.tolist(), table[name].values.tolist(), strict=True))
+    return {shape: rows.get(shape) for shape in all_registered(study)["shape"].values.tolist()}
 
 
-def is_unknown(values: np.ndarray) -> np.ndarray:
-    """Which shapes ``(s,)`` lack a value."""
-    unknown = values == "" if values.dtype.kind == "U" else np.isnan(values.astype(float))
-    return unknown.reshape(len(values), -1).any(axis=1)
+def lacks_value(values: np.ndarray) -> np.ndarray:
+    """Return a mask of the shapes ``(s,)`` with a missing value."""
+    missing = values == "" if values.dtype.kind == "U" else np.isnan(values.astype(float))
+    return missing.reshape(len(values), -1).any(axis=1)
 
 
 def group_sizes(group: np.ndarray) -> str:
-    """The sizes of groups in words.
+    """Return the sizes of groups in words, with a warning for groups under 10 shapes.
 
-    ValueError where there is one group only or one has fewer than 3 shapes, a warning under 10.
+    Raises ValueError if there is only one group, or one has fewer than 3 shapes.
     """
     names, count = np.unique(group, return_counts=True)
     sizes = [f"{name}: {n}" for name, n in zip(names, count, strict=True)]
@@ -326,8 +331,8 @@ def group_sizes(group: np.ndarray) -> str:
         )
     if count.min() < 10:
         log.warning(
-            "groups under 10 shapes (%s): only large differences can be found, "
-            "effect sizes are uncertain",
+            "groups under 10 shapes (%s): only large differences can be detected, "
+            "and effect sizes are uncertain",
             ", ".join(sizes),
         )
     return ", ".join(sizes)
@@ -336,7 +341,7 @@ def group_sizes(group: np.ndarray) -> str:
 def covariates_of(
     study: xr.DataTree, covariates: Values | dict[str, Values] | list[str] | None
 ) -> dict[str, np.ndarray]:
-    """What is accounted for: name -> values ``(shape,)`` or ``(shape, c)``."""
+    """Return the covariates by name, with values ``(shape,)`` or ``(shape, c)``."""
     if covariates is None:
         return {}
     shapes = set(registration_of(study)["shape"].values.tolist())
@@ -347,18 +352,17 @@ def covariates_of(
         covariates = {name: name for name in covariates}
     elif not isinstance(covariates, dict) or shapes <= set(covariates):
         covariates = {"": covariates}
-    found = {}
+    columns = {}
     for name, values in covariates.items():
         what = f"covariate {name!r}" if name else "covariate"
-        found[what] = values_of(study, values, "covariate" if is_names else what)
-    return found
+        columns[what] = values_of(study, values, "covariate" if is_names else what)
+    return columns
 
 
 def columns_of(covariates: dict[str, np.ndarray]) -> tuple[np.ndarray | None, str]:
-    """Columns of numbers ``(s, c)`` of covariates, text as indicators, and the same in words.
+    """Return covariates as columns of numbers ``(s, c)``, text as indicators, and in words.
 
-    A column that is constant, or a combination of others, changes no test and is named in a
-    warning; so is one that numbers the shapes.
+    Warns about columns that are constant, a combination of others, or a numbering of the shapes.
 
     Examples
     --------
@@ -391,8 +395,8 @@ def columns_of(covariates: dict[str, np.ndarray]) -> tuple[np.ndarray | None, st
     for name, values in zip(names, Z.T, strict=True):
         if numbers_shapes(name, values):
             log.warning(
-                "%s has another whole number for each shape, %.0f to %.0f: leave it out if it "
-                "numbers the shapes, as it then measures nothing of them",
+                "%s has a different integer for each shape, %.0f to %.0f: omit it if it only "
+                "numbers the shapes",
                 name,
                 values.min(),
                 values.max(),
@@ -401,9 +405,9 @@ def columns_of(covariates: dict[str, np.ndarray]) -> tuple[np.ndarray | None, st
 
 
 def numbers_shapes(name: str, values: np.ndarray) -> bool:
-    """Whether a column seems to number the shapes, and to measure nothing of them.
+    """Return whether a column seems to number the shapes.
 
-    Its whole numbers all differ, and have no gaps or the name of identifiers.
+    Its integers are distinct, and consecutive or called identifiers.
 
     Examples
     --------
@@ -421,20 +425,20 @@ def _indicators_of(values, name):
     groups, numbers = indicators(values)
     if len(values) and all(DATE.fullmatch(value) for value in groups):
         raise ValueError(
-            f"{name} holds dates, such as {groups[0]}; give them as a number, such as years since "
+            f"{name} has dates, such as {groups[0]}; give them as a number, such as years since "
             "the first"
         )
     if 2 * len(groups) > len(values):
         raise ValueError(
             f"{name} is text with {len(groups)} different values for {len(values)} shapes, such as "
-            f"{listed(groups.tolist(), most=3)}: it names shapes, not groups of them, and cannot "
-            "be accounted for"
+            f"{listed(groups.tolist(), most=3)}: it names shapes, not groups, and cannot be a "
+            "covariate"
         )
     return groups.tolist(), numbers
 
 
 def redundant(Z: np.ndarray, names: list[str]) -> list[str]:
-    """Which columns ``(s, c)`` are constant or combinations of those before them, in words.
+    """List the columns ``(s, c)`` that are constant or combinations of earlier ones, in words.
 
     Examples
     --------
@@ -447,16 +451,16 @@ def redundant(Z: np.ndarray, names: list[str]) -> list[str]:
     d is a linear combination of a, b and changes nothing
     """
     columns, rounding = standardize(Z)
-    kept: list[int] = []
+    independent: list[int] = []
     lines = []
     for i, name in enumerate(names):
-        before = columns[:, kept]
+        before = columns[:, independent]
         weight = np.linalg.lstsq(before, columns[:, i], rcond=None)[0]
         if not columns[:, i].any():
             lines.append(f"{name} is constant and changes nothing")
         elif np.linalg.norm(columns[:, i] - before @ weight) <= max(1e-8, rounding):
-            others = [names[k] for k, w in zip(kept, weight, strict=True) if abs(w) > 1e-6]
+            others = [names[k] for k, w in zip(independent, weight, strict=True) if abs(w) > 1e-6]
             lines.append(f"{name} is a linear combination of {listed(others)} and changes nothing")
         else:
-            kept.append(i)
+            independent.append(i)
     return lines

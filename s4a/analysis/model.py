@@ -1,10 +1,10 @@
-"""How good a model of variation is: compactness, generalization, specificity, chance (6.1, Fig. 5).
+"""Quality of the shape model: compactness, generalization, specificity, chance (6.1, Fig. 5).
 
 The measures are those of Davies (2002) and Styner et al. (2003), in the unit of the data.  A vertex
-distance is the root of the area-weighted mean square distance between corresponding vertices; it
-lives in the Gram matrix of the displacements, so that it costs nothing on large meshes.  The
-template, the correspondences and the alignment were made from all shapes together; what is left out
-here is left out of the model only, and the attribute ``correspondence`` says so.
+distance is the root of the area-weighted mean square distance between corresponding vertices.  It
+is computed from the Gram matrix of the displacements, which is fast for large meshes.  Template,
+correspondences and alignment depend on all shapes; a left-out shape is left out of the model only,
+as the attribute ``correspondence`` records.
 """
 
 import numpy as np
@@ -24,9 +24,9 @@ KEPT = "kept from the whole collection: optimistic"
 
 
 def describe_by_others(
-    inner: np.ndarray, cross: np.ndarray, own: float
+    inner: np.ndarray, cross: np.ndarray, squared_norm: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A field against the model of others.
+    """Reconstruct a field by the model of other fields.
 
     Parameters
     ----------
@@ -34,17 +34,17 @@ def describe_by_others(
         Gram matrix of the others.
     cross : float ndarray (n,)
         Inner products of the field and the others.
-    own : float
-        Of the field with itself.
+    squared_norm : float
+        Inner product of the field with itself.
 
     Returns
     -------
     error : float ndarray (n,)
         Vertex distance after reconstruction with 0, 1, ... n - 1 components.
     score : float ndarray (n - 1,)
-        Scores in standard deviations; NaN where there are fewer components.
+        Scores in standard deviations; NaN if there are fewer components.
     steps : float ndarray (c, n)
-        Row c: what component c adds, in terms of the others less their mean.
+        Row c: the part of component c, as coefficients of the centred others.
     """
     n = len(inner)
     variance, V = principal_components(inner)
@@ -52,7 +52,7 @@ def describe_by_others(
     deviation = np.sqrt(variance)
     length = np.sqrt(variance * (n - 1))  # of the components, as sums of the others
     # with m the mean of the others: <x - m, x - m>, and <x - m, x_j - m>
-    total = own - 2 * cross.mean() + inner.mean()
+    total = squared_norm - 2 * cross.mean() + inner.mean()
     cross = cross - inner.mean(0) - cross.mean() + inner.mean()
     coefficient = (cross @ V) / length  # (c,)
     squared = total - np.concatenate([[0], np.cumsum(coefficient**2)])  # (c + 1,)
@@ -65,47 +65,45 @@ def describe_by_others(
 
 
 def leave_one_out(K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every field against the model of all others, as :func:`describe_by_others` has it.
+    """Reconstruct every field by the model of all others, see :func:`describe_by_others`.
 
-    The scatter of the others is that of all less a matrix of rank one, S - s / (s - 1) x x^T with x
-    the field less the mean of all, so that their components come from those of all (Golub 1973) in
-    O(s^2) for each field.
+    The scatter of the others is a rank-one downdate of that of all, S - s / (s - 1) x x^T with the
+    centred field x.  Its components are updated in O(s^2) for each field (Golub 1973).
 
     Parameters
     ----------
     K : float ndarray (s, s)
-        As of :func:`s4a.method.pca.gram`.
+        Gram matrix of :func:`s4a.method.pca.gram`.
 
     Returns
     -------
     error : float ndarray (s, s - 1)
         Vertex distance after reconstruction with 0, 1, ... s - 2 components.
     score : float ndarray (s, s - 2)
-        Scores in standard deviations of the others' model, positive, as the sign of a component is
-        nobody's choice.
+        Absolute scores in standard deviations of the model of the others.
     """
     s = len(K)
     centred = center_gram(K)
     variance, V = principal_components(centred)
     scatter = variance * (s - 1)
-    grown = s / (s - 1)  # of a field less the mean of the others, to that less the mean of all
+    ratio = s / (s - 1)  # deviation from the mean of the others by that from the mean of all
     error, score = np.zeros((s, s - 1)), np.full((s, s - 2), np.nan)
     if not len(scatter):  # equal fields
         return error, score
     for i in range(s):
-        left, coefficient = downdate(scatter, V[i] * np.sqrt(scatter), grown)
-        least = max(1e-12 * left[0], s * np.finfo(float).eps * scatter[0])
-        n = min((left > least).sum(), s - 2)
-        left, coefficient = left[:n], coefficient[:n]
+        eigenvalue, coefficient = downdate(scatter, V[i] * np.sqrt(scatter), ratio)
+        least = max(1e-12 * eigenvalue[0], s * np.finfo(float).eps * scatter[0])
+        n = min((eigenvalue > least).sum(), s - 2)
+        eigenvalue, coefficient = eigenvalue[:n], coefficient[:n]
         explained = np.concatenate([[0], np.cumsum(coefficient**2)])
-        rest = np.sqrt(np.maximum(grown**2 * centred[i, i] - explained, 0))
-        error[i] = np.pad(rest, (0, s - 1 - len(rest)), mode="edge")
-        score[i, :n] = coefficient / np.sqrt(left / (s - 2))
+        residual = np.sqrt(np.maximum(ratio**2 * centred[i, i] - explained, 0))
+        error[i] = np.pad(residual, (0, s - 1 - len(residual)), mode="edge")
+        score[i, :n] = coefficient / np.sqrt(eigenvalue / (s - 2))
     return error, score
 
 
 def downdate(d: np.ndarray, z: np.ndarray, rho: float) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues of diag(d) - rho z z^T, and how long rho z is along each eigenvector.
+    """Return the eigenvalues of diag(d) - rho z z^T, and |rho z| along each eigenvector.
 
     Parameters
     ----------
@@ -113,7 +111,7 @@ def downdate(d: np.ndarray, z: np.ndarray, rho: float) -> tuple[np.ndarray, np.n
         Positive, descending.
     z : float ndarray (c,)
     rho : float
-        Positive; no eigenvalue is under 0 but by rounding.
+        Positive; the matrix must be semi-definite up to rounding.
 
     Returns
     -------
@@ -130,32 +128,31 @@ def downdate(d: np.ndarray, z: np.ndarray, rho: float) -> tuple[np.ndarray, np.n
     >>> eigenvalue.round(6).tolist(), along.round(6).tolist()
     ([2.5, 2.0], [0.5, 0.0])
     """
-    # of equal eigenvalues one eigenvector takes all of z, the others stay as they are; so do those
-    # on which z is nothing (Dongarra & Sorensen 1987)
+    # deflation of equal eigenvalues and of zero entries of z (Dongarra & Sorensen 1987)
     least = 8 * np.finfo(float).eps * d[0]
     group = np.cumsum(np.r_[False, d[:-1] - d[1:] > least])
     w = np.zeros(len(d))
     w[np.unique(group, return_index=True)[1]] = rho * np.bincount(group, z**2)
-    moves = np.sqrt(w * w.sum()) > least
+    changes = np.sqrt(w * w.sum()) > least
     eigenvalue, along = d.copy(), np.zeros(len(d))
-    if moves.any():
-        eigenvalue[moves], slope = secular_roots(d[moves], w[moves])
-        along[moves] = np.sqrt(rho / slope)
+    if changes.any():
+        eigenvalue[changes], slope = secular_roots(d[changes], w[changes])
+        along[changes] = np.sqrt(rho / slope)
     order = np.argsort(-eigenvalue, kind="stable")
     return eigenvalue[order], along[order]
 
 
 def secular_roots(d: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The roots of f(x) = sum_j w_j / (d_j - x) - 1, and the slopes of f there.
+    """Return the roots of the secular equation f(x) = sum_j w_j / (d_j - x) - 1, and slopes of f.
 
-    One lies under each d_k and over the next, the last one over 0.  All are sought at once, each
-    from its nearer pole (Li 1994: f is near c + a / (d_k - x) + b / (d_k+1 - x), whose root is the
-    next x), by halves where that does not end.
+    There is one root between consecutive d_k, and the last is above 0.  All are iterated together,
+    relative to the nearer pole, with the rational approximation c + a / (d_k - x) + b / (d_k+1 - x)
+    of Li (1994), and by bisection if that fails.
 
     Parameters
     ----------
     d : float ndarray (c,)
-        Different, positive, descending.
+        Distinct, positive, descending.
     w : float ndarray (c,)
         Positive.
 
@@ -166,46 +163,47 @@ def secular_roots(d: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     eps = np.finfo(float).eps
     under = np.append(d[1:], 0.0)
     half = (d - under) / 2
-    is_high = 1 / (d - (under + half)[:, None]) @ w < 1  # the root is nearer to d_k
+    is_high = 1 / (d - (under + half)[:, None]) @ w < 1  # the root is closer to d_k
     origin = np.where(is_high, d, under)
     x = np.where(is_high, -half, half)
     low, high = np.minimum(x, 0), np.maximum(x, 0)
     slope = np.zeros(len(d))
-    pole = np.where(is_high, w, np.append(w[1:], 0.0))  # weight of the nearer one
+    pole = np.where(is_high, w, np.append(w[1:], 0.0))  # weight of the nearer pole
     todo = np.arange(len(d))
     for step in range(200):
         inverse = 1 / ((d - origin[todo, None]) - x[todo, None])  # (root, c)
         f = inverse @ w - 1
-        far = np.abs(inverse) @ w + 1
+        magnitude = np.abs(inverse) @ w + 1
         inverse *= inverse
         slope[todo] = df = inverse @ w
         low[todo] = np.where(f < 0, x[todo], low[todo])
         high[todo] = np.where(f < 0, high[todo], x[todo])
-        wide = high[todo] - low[todo]
-        left = (np.abs(f) > 4 * eps * far) & (wide > 2 * eps * np.abs(x[todo]) + eps**2 * d[0])
-        todo, f, df = todo[left], f[left], df[left]
+        width = high[todo] - low[todo]
+        is_open = width > 2 * eps * np.abs(x[todo]) + eps**2 * d[0]
+        is_open &= np.abs(f) > 4 * eps * magnitude
+        todo, f, df = todo[is_open], f[is_open], df[is_open]
         if not len(todo):
             return origin + x, slope
         a, b = (end[todo] - origin[todo] - x[todo] for end in (d, under))
         upper = is_high[todo]
-        # the nearer pole with its own weight, the other with what makes the slope right
+        # the nearer pole has its exact weight, that of the other matches the slope
         near, other = np.where(upper, a, b), np.where(upper, b, a)
         c = f - other * df - pole[todo] / near * (1 - other / near)
         B = (a + b) * f - a * b * df
         root = np.sqrt(np.abs(B**2 - 4 * a * b * f * c))
         with np.errstate(divide="ignore", invalid="ignore"):
-            move = np.where(B <= 0, (B - root) / (2 * c), 2 * a * b * f / (B + root))
-        new = x[todo] + move
-        halved = (low[todo] + high[todo]) / 2
+            change = np.where(B <= 0, (B - root) / (2 * c), 2 * a * b * f / (B + root))
+        new = x[todo] + change
+        middle = (low[todo] + high[todo]) / 2
         inside = (new > low[todo]) & (new < high[todo]) & (step < 20)
-        x[todo] = np.where(inside, new, halved)
+        x[todo] = np.where(inside, new, middle)
     raise ArithmeticError(f"{len(todo)} of {len(d)} eigenvalues were not found")
 
 
 def specificity(
     K: np.ndarray, n_samples: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertex distances of random shapes of the model to the nearest shape of the collection.
+    """Return vertex distances of random shapes of the model to the nearest shape of the collection.
 
     Parameters
     ----------
@@ -239,12 +237,14 @@ def specificity(
 def variance_baseline(
     features: np.ndarray, n_permutations: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Shares of variance by chance: every feature permuted over the shapes by itself (Horn 1965).
+    """Return variance shares under the null hypothesis of independent features (Horn 1965).
+
+    Every feature is permuted over the shapes.
 
     Parameters
     ----------
     features : float ndarray (s, f)
-        In a basis that is orthonormal, so that the permuted fields are as smooth as the true ones.
+        Coefficients in an orthonormal basis, so that permuted fields are as smooth as the data.
 
     Returns
     -------
@@ -270,9 +270,9 @@ def count_components(
     share: float = 0.9,
     at_most: int | None = None,
 ) -> int:
-    """How many components of s shapes a test takes; ValueError where it would be more than `most`.
+    """Return the number of components of a test of s shapes; ValueError if it exceeds `most`.
 
-    By default as many as hold `share` of the variance, at most half of the shapes or `at_most`.
+    By default the components of `share` of the variance, at most half of the shapes or `at_most`.
 
     Examples
     --------
@@ -288,26 +288,26 @@ def count_components(
         n_components = max(1, min(enough, limit, len(variance), most))
     c = int(n_components)
     if not 1 <= c <= most:
-        raise ValueError(f"n_components needs a number from 1 to {most}, found {c}")
+        raise ValueError(f"n_components needs a number from 1 to {most}; found {c}")
     return c
 
 
 def mean_distance(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Mean distance of points ``(..., p, 3)`` to a surface ``(...)``."""
+    """Return the mean distance of points ``(..., p, 3)`` to a surface ``(...)``."""
     return distance_to_surface(P.reshape(-1, 3), X, T).reshape(P.shape[:-1]).mean(-1)
 
 
 def surface_error(
     points: np.ndarray, steps: np.ndarray, X: np.ndarray, T: np.ndarray
 ) -> np.ndarray:
-    """Mean distances of reconstructions of a left-out shape to its surface X, T.
+    """Return mean distances of reconstructions of a left-out shape to its surface X, T.
 
     Parameters
     ----------
     points : float ndarray (n, p, 3)
-        The same points on all other shapes.
+        Corresponding points on all other shapes.
     steps : float ndarray (c, n)
-        As of :func:`describe_by_others`.
+        Result of :func:`describe_by_others`.
 
     Returns
     -------
@@ -321,7 +321,7 @@ def surface_error(
 
 
 def draw_points(area: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Vertices ``(n,)`` to measure distances to surfaces from: drawn by area (of sum 1), sorted."""
+    """Draw vertices ``(n,)`` with probability by area (of sum 1), sorted."""
     return np.sort(rng.choice(len(area), min(n, len(area)), replace=False, p=area))
 
 
@@ -335,20 +335,21 @@ def evaluate(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """Compactness, generalization and specificity for every number of components, and chance.
+    """Measure compactness, generalization and specificity for every number of components.
 
     Parameters
     ----------
     study : DataTree
     n_samples : int
-        Random shapes for specificity.
+        Number of random shapes for specificity.
     n_permutations : int
-        Of the baseline: every coefficient of the displacements in the template's eigenfunctions
-        permuted over the shapes by itself (Horn 1965), so that fields stay as smooth as they are.
+        Permutations of the baseline (parallel analysis, Horn 1965): every coefficient of the
+        displacements in the template's eigenfunctions is permuted over the shapes, so that fields
+        stay smooth.
     n_points : int
-        Vertices from which distances to surfaces are measured; 0 leaves these out.
+        Vertices from which distances to surfaces are measured; 0 omits these measures.
     n_surface : int
-        Random shapes whose distances to surfaces are measured.
+        Number of random shapes whose distances to surfaces are measured.
     seed, rng : see :mod:`s4a.seeds`
 
     Returns
@@ -366,11 +367,24 @@ def evaluate(
     Raises
     ------
     ValueError
-        When the study is not registered or has fewer than 4 shapes.
+        If the study is not registered or has fewer than 4 shapes.
+
+    See Also
+    --------
+    outliers : Leave-one-out error of each shape.
+    sample : Random shapes of the model.
+
+    References
+    ----------
+    Davies, R. H. (2002). Learning shape: optimal models for analysing natural variability. PhD
+    thesis, University of Manchester.
+    Styner, M. et al. (2003). Evaluation of 3D correspondence methods for model building. IPMI.
+    Horn, J. L. (1965). A rationale and test for the number of factors in factor analysis.
+    Psychometrika 30(2).
 
     Examples
     --------
-    With the ``study`` of six small brains; more modes describe a left-out shape better:
+    In a study of six small brains, more modes reconstruct a left-out shape better:
 
     >>> import s4a
     >>> from s4a.analysis.model import evaluate
@@ -381,10 +395,10 @@ def evaluate(
     """
     registration, d, area = displacements_of(study)
     s = len(d)
-    draw = np.random.default_rng(seed_of(seed, rng))
+    generator = np.random.default_rng(seed_of(seed, rng))
     K = gram(d - d.mean(0), area)
     error, _ = leave_one_out(K)
-    distance, nearest, score = specificity(K, n_samples, draw)
+    distance, nearest, score = specificity(K, n_samples, generator)
     variance, _ = principal_components(K)
     c = len(variance)
     compactness = np.cumsum(variance)
@@ -398,17 +412,17 @@ def evaluate(
         specificity_error=stats.sem(distance, axis=1),
     )
     if n_points:
-        points = draw_points(area, n_points, draw)
+        points = draw_points(area, n_points, generator)
         P = registration["position"].values[points] + d[:, points]  # (s, p, 3)
-        few = score[:n_surface], nearest[:, :n_surface]
-        quality = quality.merge(_measure_surfaces(registration, d, K, P, *few))
+        samples = score[:n_surface], nearest[:, :n_surface]
+        quality = quality.merge(_measure_surfaces(registration, d, K, P, *samples))
     quality = in_unit(quality, unit_of(registration["displacement"]))
     features = _coefficients(study, d, area)
-    return quality.merge(_compare_with_chance(features, c, n_permutations, draw))
+    return quality.merge(_compare_with_chance(features, c, n_permutations, generator))
 
 
 def _per_component(values, c):
-    """Values of 1, 2, ... components ``(c,)``; NaN for those that no left-out shape can have."""
+    """Values for 1, 2, ... components ``(c,)``, NaN beyond the components of left-out models."""
     return np.pad(values, (0, c), constant_values=np.nan)[:c]
 
 
@@ -422,23 +436,23 @@ def _measure_surfaces(registration, d, K, P, score, nearest):
         others = np.delete(np.arange(len(d)), i)
         *_, steps = describe_by_others(K[np.ix_(others, others)], K[i, others], K[i, i])
         rows.append(surface_error(P[others], steps, X + d[i], T))
-    kept = np.stack(rows)  # (s, s - 1)
+    error = np.stack(rows)  # (s, s - 1)
     modes = np.einsum("sc,spx->cpx", V, P - P.mean(0)) / np.sqrt(len(d) - 1)
     samples = P.mean(0) + np.cumsum(score[:, :, None, None] * modes, axis=1)  # (n_samples, c, p, 3)
-    random = np.zeros(nearest.shape)  # (c, n_samples)
+    distance = np.zeros(nearest.shape)  # (c, n_samples)
     for i in np.unique(nearest):
         component, sample = np.nonzero(nearest == i)
-        random[component, sample] = mean_distance(samples[sample, component], X + d[i], T)
+        distance[component, sample] = mean_distance(samples[sample, component], X + d[i], T)
     return dataset(
-        generalization_surface=_per_component(kept[:, 1:].mean(0), c),
-        generalization_surface_error=_per_component(stats.sem(kept[:, 1:]), c),
-        specificity_surface=random.mean(1),
-        specificity_surface_error=stats.sem(random, axis=1),
+        generalization_surface=_per_component(error[:, 1:].mean(0), c),
+        generalization_surface_error=_per_component(stats.sem(error[:, 1:]), c),
+        specificity_surface=distance.mean(1),
+        specificity_surface_error=stats.sem(distance, axis=1),
     )
 
 
 def _compare_with_chance(features, c, n_permutations, rng):
-    """Shares of variance of the first c components, and those of permuted features."""
+    """Variance shares of the first c components, of the data and of permuted features."""
     ratio = np.linalg.svd(features - features.mean(0), compute_uv=False)[:c] ** 2
     null = variance_baseline(features, n_permutations, rng)[:, :c]
     return dataset(
@@ -449,11 +463,11 @@ def _compare_with_chance(features, c, n_permutations, rng):
 
 
 def _coefficients(study, d, area):
-    """Displacements in an orthonormal basis of the template's smooth functions ``(s, f)``.
+    """Coefficients ``(s, f)`` of displacements in an orthonormal basis of the eigenfunctions.
 
-    Where the study has no eigenfunctions, the basis is that of the vertices.
+    Without eigenfunctions, in the basis of the vertices.
     """
-    template = study["registration"].attrs.get("template", "")  # none where it is no shape
+    template = study["registration"].attrs.get("template", "")  # empty if it is not a shape
     if "coarse" not in study or template not in study["coarse"].children:
         return (d * np.sqrt(area)[:, None]).reshape(len(d), -1).astype(float)
     shape = Shape(study["original"][template].to_dataset(), study["coarse"][template].to_dataset())
@@ -470,12 +484,13 @@ def sample(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.DataTree:
-    """New shapes from the model: normal scores on the first components.
+    """Draw random shapes of the model, with normal scores on the first components.
 
     Parameters
     ----------
     study : DataTree
     n : int
+        Number of shapes.
     n_components : int, optional
         All by default.
     seed, rng : see :mod:`s4a.seeds`
@@ -488,11 +503,15 @@ def sample(
     Raises
     ------
     ValueError
-        When there are not as many components.
+        If there are not as many components.
+
+    See Also
+    --------
+    s4a.synthesize : The shape of given scores.
 
     Examples
     --------
-    With the ``study`` of six small brains:
+    In a study of six small brains:
 
     >>> import s4a
     >>> from s4a.analysis.model import sample
@@ -504,7 +523,7 @@ def sample(
     most = study["pca"].sizes["component"]
     c = most if n_components is None else n_components
     if not 1 <= c <= most:
-        raise ValueError(f"n_components needs a number from 1 to {most}, found {c}")
+        raise ValueError(f"n_components needs a number from 1 to {most}; found {c}")
     score = np.random.default_rng(seed_of(seed, rng)).normal(size=(n, c))
     names = [f"sample_{i + 1:0{len(str(n))}d}" for i in range(n)]
     meshes = {name: synthesize(study, row) for name, row in zip(names, score, strict=True)}

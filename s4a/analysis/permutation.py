@@ -1,12 +1,11 @@
-"""Permutation tests on plain arrays (6.1): of a whole shape by its scores, and of every vertex.
+"""Permutation tests of plain arrays (6.1): whole shapes by their scores, and every vertex.
 
-The general linear model is Y = Z G + X B + E: Z the intercept and the covariates, X what is tested
-(a variable, or the indicators of groups).  After Freedman & Lane (1983) the residuals of Y on Z are
-permuted; only the part of X that is orthogonal to Z counts.  Permutations take all shapes as drawn
-with one variance.  Where it differs, between groups or with the variable, the signs of the
-residuals are changed at random instead (the wild bootstrap: Liu 1988; Winkler et al. 2014): every
-shape keeps its own variance, and errors need to be symmetric.  Shapes of one block, as visits of
-one subject, change places with each other alone, or their signs together.
+The general linear model is Y = Z G + X B + E, with intercept and covariates Z, and the tested
+variable or indicators of groups X.  The residuals of Y on Z are permuted (Freedman & Lane 1983),
+and X is orthogonalised to Z.  Permutations assume homogeneous variance.  If it differs between
+groups or with the variable, signs of the residuals are flipped at random instead (wild bootstrap:
+Liu 1988; Winkler et al. 2014), which assumes symmetric errors.  Shapes of one block, such as visits
+of one subject, are permuted within the block, or flipped together.
 """
 
 import itertools
@@ -27,24 +26,23 @@ VARIANCES = ("equal", "unequal")
 
 
 def check_permutations(n: int) -> None:
-    """ValueError unless so many permutations can be drawn."""
+    """Raise ValueError unless the number of permutations is in range."""
     if not 1 <= n <= MOST_PERMUTATIONS:
-        raise ValueError(f"n_permutations needs a number from 1 to {MOST_PERMUTATIONS}, found {n}")
+        raise ValueError(f"n_permutations needs a number from 1 to {MOST_PERMUTATIONS}; found {n}")
 
 
 def check_options(n_permutations: int, variances: str, seed: int) -> dict[str, Any]:
-    """The options of a :class:`Model`, checked before anything is computed."""
+    """Return the options of a :class:`Model` after a check."""
     check_permutations(n_permutations)
     if variances not in VARIANCES:
-        raise ValueError(f"variances must be 'equal' or 'unequal', found {variances!r}")
+        raise ValueError(f"variances must be 'equal' or 'unequal'; found {variances!r}")
     return {"n_permutations": n_permutations, "variances": variances, "seed": seed}
 
 
 def standardize(columns: np.ndarray) -> tuple[np.ndarray, float]:
-    """Columns ``(n, c)`` less their mean and of length 1, or 0, and what of them may be rounding.
+    """Centre columns ``(n, c)`` and scale them to length 1; return the rounding error, too.
 
-    A column is 0 when it varies by no more than rounding does at its size: 0.1 added up ten times
-    is not always 1, and 1e9 + 1e-7 is no other number than 1e9.
+    Columns that vary only by rounding are set to 0: the sum of ten times 0.1 is not always 1.
 
     Examples
     --------
@@ -65,9 +63,9 @@ def standardize(columns: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def design(x: np.ndarray, covariates: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Orthonormal bases of Z, ``(n, r)``, and of the part of X orthogonal to it, ``(n, q)``.
+    """Return orthonormal bases of Z ``(n, r)`` and of the part of X orthogonal to Z ``(n, q)``.
 
-    Neither the unit nor the origin of a column changes them.
+    They do not depend on the unit or origin of a column.
 
     Parameters
     ----------
@@ -77,8 +75,7 @@ def design(x: np.ndarray, covariates: np.ndarray | None = None) -> tuple[np.ndar
     Raises
     ------
     ValueError
-        When X is constant or a combination of the covariates, or too few shapes are left to
-        estimate anything.
+        If X is constant or a combination of the covariates, or there are too few shapes.
     """
     n = len(x)
     X, rounding = standardize(np.reshape(x, (n, -1)))
@@ -89,30 +86,30 @@ def design(x: np.ndarray, covariates: np.ndarray | None = None) -> tuple[np.ndar
         U, S, _ = np.linalg.svd(columns, full_matrices=False)
         Z = np.column_stack([Z, U[:, S > max(1e-8, rounding)]])  # (n, r)
     if not X.any(axis=0).all():
-        raise ValueError("what is tested is constant; a test needs values that differ")
+        raise ValueError("the tested variable is constant; a test needs values that differ")
     U, S, _ = np.linalg.svd(X - Z @ (Z.T @ X), full_matrices=False)
     Q = U[:, S > max(1e-8, rounding)]  # (n, q)
     r, q = Z.shape[1], Q.shape[1]
     if n - r - q < 2:
         raise ValueError(
-            f"{n} shapes are too few for a model of {r + q} columns (the mean, {r - 1} of the "
-            f"covariates, {q} of what is tested): {r + q + 2} shapes needed, or fewer covariates"
+            f"{n} shapes are too few for a model of {r + q} columns (mean, {r - 1} covariates, "
+            f"{q} tested): use {r + q + 2} shapes or fewer covariates"
         )
     if q < np.linalg.matrix_rank(X):
-        raise ValueError("what is tested is a combination of the covariates; leave one of them out")
+        raise ValueError("the tested variable is a combination of the covariates; omit one of them")
     return Z, Q
 
 
 def indicators(group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Names of the groups, sorted, and indicator columns of all but the first ``(n, g - 1)``."""
+    """Return sorted names of groups, and indicator columns without the first ``(n, g - 1)``."""
     names, code = np.unique(group, return_inverse=True)
     return names, (code[:, None] == np.arange(1, len(names))).astype(float)
 
 
 def shrunk_covariance(R: np.ndarray) -> np.ndarray:
-    """Covariances ``(..., p, p)`` of centred samples ``(..., n, p)``, after Ledoit & Wolf (2004).
+    """Return Ledoit-Wolf covariances ``(..., p, p)`` of centred samples ``(..., n, p)``.
 
-    As :func:`sklearn.covariance.ledoit_wolf`, of many samples at once.
+    As :func:`sklearn.covariance.ledoit_wolf` (Ledoit & Wolf 2004), vectorised over samples.
 
     Examples
     --------
@@ -127,30 +124,30 @@ def shrunk_covariance(R: np.ndarray) -> np.ndarray:
     S = R.swapaxes(-1, -2) @ R / n
     size = np.trace(S, axis1=-2, axis2=-1) / p
     squared = (S**2).sum((-2, -1))
-    far = squared / p - size**2  # squared distance to the sphere of the same size
+    distance = squared / p - size**2  # squared distance to the scaled identity
     fourth = ((R**2).sum(-1) ** 2).sum(-1)
-    uncertain = (fourth / n - squared) / (p * n)
-    share = np.clip(uncertain / np.where(far > 0, far, 1), 0, 1) * (far > 0)
+    error = (fourth / n - squared) / (p * n)
+    share = np.clip(error / np.where(distance > 0, distance, 1), 0, 1) * (distance > 0)
     share, size = share[..., None, None], size[..., None, None]
     return (1 - share) * S + share * size * np.eye(p)
 
 
 def hotelling(E: np.ndarray, Q: np.ndarray, dof: int) -> np.ndarray:
-    """Hotelling's T^2 (Lawley and Hotelling's trace for several columns of X), ``(...,)``.
+    """Return Hotelling's T^2 ``(...,)``, the Lawley-Hotelling trace for several columns of X.
 
     Parameters
     ----------
     E : float ndarray (..., n, p)
         Residuals of the scores on the covariates.
     Q : float ndarray (n, q)
-        As of :func:`design`.
+        Basis of X of :func:`design`.
     dof : int
         Degrees of freedom of the error, n - r - q.
     """
     n, p = E.shape[-2:]
     H = Q.T @ E  # (..., q, p)
     S = shrunk_covariance(E - Q @ H) * n / dof  # (..., p, p)
-    # where nothing is left unexplained the statistic is large, and a number
+    # keeps the statistic finite if X explains everything
     least = 1e-12 * (E**2).mean((-2, -1)) + np.finfo(float).tiny
     S = S + least[..., None, None] * np.eye(p)
     return np.einsum("...qp,...pq->...", H, np.linalg.solve(S, H.swapaxes(-1, -2)))
@@ -158,21 +155,21 @@ def hotelling(E: np.ndarray, Q: np.ndarray, dof: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Model:
-    """What a permutation test is of, and how residuals are rearranged in it.
+    """General linear model of a permutation test.
 
     Parameters
     ----------
     x : float ndarray (n,) or (n, q)
-        What is tested: a variable, or :func:`indicators`.
+        Tested variable, or :func:`indicators` of groups.
     covariates : float ndarray (n, c), optional
     variances : {"equal", "unequal"}
-        Residuals are permuted, or have their signs changed.
+        Permute residuals, or flip their signs.
     blocks : ndarray (n,), optional
-        Residuals are permuted within these, or change their signs with all of their block; x,
-        covariates and what is tested have mean zero in every block then.
+        Permute residuals within blocks, or flip the signs of whole blocks; x, covariates and data
+        must have mean zero in every block.
     n_permutations, seed : int
     intercept : bool
-        Whether the mean is accounted for; without it x = 1 tests whether it is zero.
+        Whether the model has an intercept; without it x = 1 tests whether the mean is zero.
 
     Examples
     --------
@@ -195,14 +192,14 @@ class Model:
     intercept: bool = True
 
     @classmethod
-    def of_mean(cls, n: int, n_permutations: int = 999, seed: int = 0) -> "Model":
-        """Whether the mean of n shapes is zero, by changes of their signs."""
+    def one_sample(cls, n: int, n_permutations: int = 999, seed: int = 0) -> "Model":
+        """Return the model of a test of zero mean of n shapes, by sign flips."""
         ones = np.ones(n)
         return cls(ones, None, "unequal", None, n_permutations, seed, intercept=False)
 
     @cached_property
     def bases(self) -> tuple[np.ndarray, np.ndarray]:
-        """Orthonormal bases of Z and of what is tested, see :func:`design`."""
+        """Orthonormal bases of Z and X, see :func:`design`."""
         if self.intercept:
             return design(self.x, self.covariates)
         X = np.reshape(self.x, (len(self.x), -1))
@@ -210,64 +207,63 @@ class Model:
 
     @property
     def rows(self) -> np.ndarray:
-        """The columns of each shape: what is tested, and the covariates ``(n, q + c)``."""
+        """Columns of x and covariates ``(n, q + c)``, a row per shape."""
         x = np.reshape(self.x, (len(self.x), -1))
         return x if self.covariates is None else np.column_stack([x, self.covariates])
 
     @property
-    def places(self) -> list[np.ndarray]:
-        """Where each block of exchangeable shapes stands; all are one where none is named."""
+    def block_rows(self) -> list[np.ndarray]:
+        """Rows of each block of exchangeable shapes; one block by default."""
         if self.blocks is None:
             return [np.arange(len(self.x))]
-        return [np.flatnonzero(self.blocks == one) for one in np.unique(self.blocks)]
+        return [np.flatnonzero(self.blocks == block) for block in np.unique(self.blocks)]
 
     @property
     def n_rearrangements(self) -> int:
-        """How many orders of the shapes differ, or signs of their residuals; as given is one.
+        """Number of distinct permutations or sign flips, including the identity.
 
-        Shapes of equal values of all columns take each other's place without a difference.
+        Permutations of shapes with equal values are not distinct.
         """
-        if self.variances == "unequal":  # the same signs but turned give the same statistic
-            return 2 ** ((len(self.x) if self.blocks is None else len(self.places)) - 1)
-        return math.prod(_count_orders(self.rows[of]) for of in self.places)
+        if self.variances == "unequal":  # opposite signs give the same statistic
+            return 2 ** ((len(self.x) if self.blocks is None else len(self.block_rows)) - 1)
+        return math.prod(_count_orders(self.rows[rows]) for rows in self.block_rows)
 
     @property
     def smallest_p(self) -> float:
-        """The smallest p that the test can reach.
+        """Smallest p value of the test.
 
-        Bound by the number of permutations drawn, and by how many are different: two that only
-        exchange shapes of equal values, or groups of equal size, or turn round a variable that is
-        symmetric about its mean, give the same statistic.
+        Limited by the numbers of drawn and of distinct permutations.  Permutations that exchange
+        groups of equal size, or reverse a variable that is symmetric about its mean, give the same
+        statistic.
         """
-        return max(1 / (self.n_permutations + 1), self._n_alike() / self.n_rearrangements)
+        return max(1 / (self.n_permutations + 1), self._n_equivalent() / self.n_rearrangements)
 
-    def _n_alike(self) -> int:
-        """How many rearrangements give the same statistic as any one does."""
-        # a covariate that is constant is in the mean, and changes nothing
+    def _n_equivalent(self) -> int:
+        """Number of rearrangements with the same statistic."""
+        # a constant covariate has no effect
         if self.covariates is not None and np.ptp(self.covariates, axis=0).any():
             return 1
         if self.variances == "unequal":
             return 1
-        rows = np.reshape(self.x, (len(self.x), -1))
-        if rows.shape[1] == 1:
-            sides, size = [np.sort(rows[of, 0]) for of in self.places], np.ptp(rows)
-            # the order of all turned round changes but the sign of a slope
-            return 1 + all(np.ptp(one + one[::-1]) <= 1e-9 * size for one in sides)
-        sizes = np.unique(rows, axis=0, return_counts=True)[1].tolist()
-        if self.blocks is not None or len(sizes) != rows.shape[1] + 1:
+        x = np.reshape(self.x, (len(self.x), -1))
+        if x.shape[1] == 1:
+            blocks, size = [np.sort(x[rows, 0]) for rows in self.block_rows], np.ptp(x)
+            # reversing the order only changes the sign of the slope
+            return 1 + all(np.ptp(block + block[::-1]) <= 1e-9 * size for block in blocks)
+        sizes = np.unique(x, axis=0, return_counts=True)[1].tolist()
+        if self.blocks is not None or len(sizes) != x.shape[1] + 1:
             return 1
-        return math.prod(math.factorial(sizes.count(s)) for s in set(sizes))  # groups change places
+        return math.prod(math.factorial(sizes.count(s)) for s in set(sizes))  # exchanged groups
 
-    def said(self) -> dict[str, str | int | float]:
-        """Attributes of a result; the log says where shapes are too few for any small p."""
+    def attributes(self) -> dict[str, str | int | float]:
+        """Return the attributes of a result; warn if no p value below 0.05 is possible."""
         least = self.smallest_p
         if least > 0.05:
-            of = "" if self.blocks is None else f" of {len(self.places)} subjects"
+            subjects = "" if self.blocks is None else f" of {len(self.block_rows)} subjects"
             log.warning(
-                "%d shapes%s allow no p value below %.2g, whatever they are like: more are needed, "
-                "or more permutations",
+                "%d shapes%s allow no p value below %.2g: use more shapes or more permutations",
                 len(self.x),
-                of,
+                subjects,
                 least,
             )
         return {
@@ -277,14 +273,14 @@ class Model:
         }
 
     def rearrangements(self) -> tuple[Iterator[np.ndarray], int]:
-        """What is done to the residuals: orders, or signs; all others where there are no more.
+        """Return random permutations or sign flips, or all of them if there are few.
 
         Returns
         -------
         rearrangements : iterator of ndarray (n,)
-            Integers, the residual that comes to each place; or with unequal variances 1.0 and -1.0.
+            Integers, an order of the residuals; with unequal variances 1.0 and -1.0.
         n_rearrangements : int
-            `n_permutations`, or the number of all that differ from what is given and each other.
+            `n_permutations`, or the number of all distinct ones without the identity.
         """
         rng = np.random.default_rng(self.seed)
         n, n_others = len(self.x), self.n_rearrangements - 1
@@ -300,39 +296,39 @@ class Model:
         return itertools.islice(drawn, self.n_permutations), self.n_permutations
 
     def _code(self) -> np.ndarray:
-        """The number of the block of each shape, whose signs are changed together."""
+        """Block number of each shape."""
         if self.blocks is None:
             return np.arange(len(self.x))
         return np.unique(self.blocks, return_inverse=True)[1]
 
     def _all(self) -> Iterator[np.ndarray]:
-        """Every rearrangement once, as is first."""
+        """All rearrangements, the identity first."""
         if self.variances == "unequal":
             code = self._code()
-            every = itertools.product([1.0, -1.0], repeat=int(code.max()))
-            return (np.array([1.0, *row])[code] for row in every)
+            signs = itertools.product([1.0, -1.0], repeat=int(code.max()))
+            return (np.array([1.0, *row])[code] for row in signs)
         if self.blocks is None:
             return _all_orders(self.rows)
-        return _orders_within(self.rows, self.places)
+        return _orders_within(self.rows, self.block_rows)
 
     def p_values(
         self, statistic: Callable[[list[np.ndarray]], np.ndarray], least: Any, at_once: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The p of statistics of residuals rearranged; exact where all rearrangements are drawn.
+        """Return p values by rearrangement of residuals; exact if all rearrangements are used.
 
         Parameters
         ----------
         statistic : callable
-            Of a list of b rearrangements: ndarray (b, ...).
+            Maps a list of b rearrangements to statistics, ndarray (b, ...).
         least : ndarray (...)
-            What counts as reaching the statistic of the shapes as they are.
+            Values that count as at least the observed statistic.
         at_once : int
             Rearrangements in a list.
 
         Returns
         -------
         p : ndarray (...)
-            (1 + number that reach the statistic) / (1 + number of all).
+            (1 + number of statistics at least as large) / (1 + number of rearrangements).
         p_max : ndarray (...)
             Family-wise, by the largest statistic (Westfall & Young 1993, single step).
         """
@@ -340,7 +336,7 @@ class Model:
         return p_values(others, n_others, statistic, least, at_once)
 
     def test(self, scores: np.ndarray) -> tuple[float, float]:
-        """Permutation test of Hotelling's T^2 of scores ``(n, p)``: the statistic and its p.
+        """Test scores ``(n, p)`` by Hotelling's T^2; return statistic and p value.
 
         Examples
         --------
@@ -356,30 +352,29 @@ class Model:
         dof = len(E) - Z.shape[1] - Q.shape[1]
         statistic = float(hotelling(E, Q, dof))
 
-        def of(batch):
+        def statistics_of(batch):
             permuted = np.stack([rearranged(E, by) for by in batch])  # (b, n, p)
             return hotelling(permuted - Z @ (Z.T @ permuted), Q, dof)
 
-        p, _ = self.p_values(of, statistic * (1 - 1e-9), max(1, 1_000_000 // E.size))
+        p, _ = self.p_values(statistics_of, statistic * (1 - 1e-9), max(1, 1_000_000 // E.size))
         return statistic, float(p)
 
     def vertex_test(
         self, d: np.ndarray, floor: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Permutation test at every vertex, with p values corrected for all by the largest (max-T).
+        """Test every vertex, with p values corrected for multiple comparisons (max-T).
 
-        The statistic is Pillai's trace, the share 0..1 of the vectors' scatter that X explains; for
-        one column of X, T^2 = dof V / (1 - V).  The scatter is that of the residuals on Z, for
-        every permutation its own: with covariates those of permuted residuals scatter less, and
-        beside the first scatter their shares would be too small.
+        The statistic is Pillai's trace V, the explained share of the vectors' scatter; for one
+        column of X, T^2 = dof V / (1 - V).  The scatter is that of the permuted residuals on Z, as
+        covariates reduce it.
 
         Parameters
         ----------
         d : float ndarray (n, v, k)
-            Fields of vectors, or with k = 1 of numbers.
+            Vector fields, or scalar fields with k = 1.
         floor : float ndarray (v,), optional
-            A standard error of the mean that is added to that of the fields, so that where they
-            hardly scatter a mean as small does not count.
+            Standard error of the mean that is added to that of the fields, so that small means at
+            vertices with little variation are not significant.
 
         Returns
         -------
@@ -390,48 +385,47 @@ class Model:
         Raises
         ------
         ValueError
-            When X explains nothing that the covariates leave, or there are too few shapes.
+            If X is a combination of the covariates, or there are too few shapes.
         """
         Z, Q = self.bases
         n, v, k = d.shape
         r, q = Z.shape[1], Q.shape[1]
-        if n - r <= k:  # the residuals fill all dimensions: what is tested explains all of them
+        if n - r <= k:  # X would explain all of the residuals
             raise ValueError(
                 f"{n} shapes are too few for a test of {k} coordinates at a vertex with {r} "
-                f"columns of mean and covariates: {r + k + 1} needed, or fewer covariates, or "
+                f"columns of mean and covariates: use {r + k + 1} shapes, fewer covariates, or "
                 "of='normal'"
             )
         E = np.asarray(d, float).reshape(n, -1)  # (n, v k)
         rounding = 1e-12 * abs(E).max()
         E = (E - Z @ (Z.T @ E)).reshape(n, v, k)
-        E[:, abs(E).max((0, 2)) <= rounding] = 0  # where nothing varies nothing is to be explained
+        E[:, abs(E).max((0, 2)) <= rounding] = 0  # no variation
         scatter = (E**2).sum((0, 2))
         E = whiten(E)
         if floor is not None:
-            whole = scatter + (n * floor) ** 2
-            E = E * np.sqrt(scatter / np.where(whole > 0, whole, 1))[:, None]
+            total = scatter + (n * floor) ** 2
+            E = E * np.sqrt(scatter / np.where(total > 0, total, 1))[:, None]
         E = E.transpose(0, 2, 1).reshape(n, -1).astype(np.float32)  # (n, k v)
 
         def project(columns, per):
-            """Products of b times `per` columns ``(n, b per)`` with residuals: (b, per, k, v)."""
+            """Multiply b times `per` columns ``(n, b per)`` with residuals: (b, per, k, v)."""
             return (columns.T.astype(np.float32) @ E).reshape(-1, per, k, v)
 
-        def of(batch):
-            # Q^T (I - Z Z^T) P E = (P^T Q)^T E, as Q is orthogonal to Z; P^T is the order back, or
-            # the same signs again
-            back = [np.argsort(by) if by.dtype.kind == "i" else by for by in batch]
-            B = project(np.concatenate([rearranged(Q, by) for by in back], axis=1), q)
+        def statistics_of(batch):
+            # Q^T (I - Z Z^T) P E = (P^T Q)^T E, as Q is orthogonal to Z; P^T is the inverse order,
+            # or the same signs
+            inverse = [np.argsort(by) if by.dtype.kind == "i" else by for by in batch]
+            B = project(np.concatenate([rearranged(Q, by) for by in inverse], axis=1), q)
             if r == 0 or (r == 1 and self.variances == "equal"):
-                # the intercept is moved by no permutation, and no sign is with none: the scatter
-                # stays 1
+                # permutations leave the intercept unchanged: the scatter stays 1
                 return (B**2).sum(axis=(1, 2))  # (b, v)
-            A = project(np.concatenate([rearranged(Z, by) for by in back], axis=1), r)
+            A = project(np.concatenate([rearranged(Z, by) for by in inverse], axis=1), r)
             return explained_share(A, B)
 
         share = (project(Q, q)[0] ** 2).sum(axis=(0, 1))
-        least = share * (1 - 1e-6) - (1e-7 if r else 0)  # of an equal share, in single precision
+        least = share * (1 - 1e-6) - (1e-7 if r else 0)  # single-precision tolerance
         at_once = max(1, int(2e7 // (v * k * (q + r))))  # 80 MB of products
-        return share, *self.p_values(of, least, at_once)
+        return share, *self.p_values(statistics_of, least, at_once)
 
 
 def p_values(
@@ -441,34 +435,34 @@ def p_values(
     least: Any,
     at_once: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As :meth:`Model.p_values`, of rearrangements that are given, and how many these are."""
-    reached = np.zeros(np.shape(least), np.int64)
+    """Return p values of given rearrangements, see :meth:`Model.p_values`."""
+    count = np.zeros(np.shape(least), np.int64)
     largest = [np.empty(0, np.float32)]
     for batch in batched(others, at_once):
-        found = statistic(batch)
-        reached += (found >= least).sum(0)
-        largest.append(found.reshape(len(found), -1).max(1))
-    beyond = n_others - np.searchsorted(np.sort(np.concatenate(largest)), least, side="left")
-    return (1 + reached) / (1 + n_others), (1 + beyond) / (1 + n_others)
+        values = statistic(batch)
+        count += (values >= least).sum(0)
+        largest.append(values.reshape(len(values), -1).max(1))
+    count_max = n_others - np.searchsorted(np.sort(np.concatenate(largest)), least, side="left")
+    return (1 + count) / (1 + n_others), (1 + count_max) / (1 + n_others)
 
 
 def _count_orders(rows):
-    """How many orders of rows differ."""
-    same = np.unique(rows, axis=0, return_counts=True)[1].tolist()
-    return math.factorial(len(rows)) // math.prod(map(math.factorial, same))
+    """Number of distinct orders of rows."""
+    counts = np.unique(rows, axis=0, return_counts=True)[1].tolist()
+    return math.factorial(len(rows)) // math.prod(map(math.factorial, counts))
 
 
-def _orders_within(rows, places):
-    """Every order once that leaves each shape in its block, as is first."""
-    each = [[of[order] for order in _all_orders(rows[of])] for of in places]
-    for chosen in itertools.product(*each):
+def _orders_within(rows, block_rows):
+    """All orders that leave each shape in its block, the identity first."""
+    orders = [[block[order] for order in _all_orders(rows[block])] for block in block_rows]
+    for chosen in itertools.product(*orders):
         order = np.empty(len(rows), int)
-        order[np.concatenate(places)] = np.concatenate(chosen)
+        order[np.concatenate(block_rows)] = np.concatenate(chosen)
         yield order
 
 
 def _drawn_within(blocks, rng):
-    """An order that leaves each shape in its block."""
+    """Random order that leaves each shape in its block."""
     code = np.unique(blocks, return_inverse=True)[1]
     order = np.empty(len(code), int)
     order[np.argsort(code, kind="stable")] = np.lexsort((rng.random(len(code)), code))
@@ -476,28 +470,28 @@ def _drawn_within(blocks, rng):
 
 
 def _all_orders(rows):
-    """Every order once in which other residuals come to the places of some row, as is first."""
+    """All orders that are distinct for rows with repetitions, the identity first."""
     code = np.unique(rows, axis=0, return_inverse=True)[1].ravel()
-    places = np.argsort(code, kind="stable")  # the places of one row after those of another
+    positions = np.argsort(code, kind="stable")  # sorted by row value
 
-    def fill(left, counts):
-        """All ways to put what is left, in order, into the places of each row."""
+    def fill(remaining, counts):
+        """Partitions of the remaining indices into groups of the given sizes."""
         if not counts:
             yield []
             return
-        for chosen in itertools.combinations(left, counts[0]):
-            rest = [i for i in left if i not in chosen]
+        for chosen in itertools.combinations(remaining, counts[0]):
+            rest = [i for i in remaining if i not in chosen]
             for others in fill(rest, counts[1:]):
                 yield [*chosen, *others]
 
-    for residuals in fill(places.tolist(), np.bincount(code).tolist()):
+    for residuals in fill(positions.tolist(), np.bincount(code).tolist()):
         order = np.empty(len(rows), int)
-        order[places] = residuals
+        order[positions] = residuals
         yield order
 
 
 def rearranged(rows: np.ndarray, by: np.ndarray) -> np.ndarray:
-    """Rows ``(n, ...)`` in another order, or with other signs."""
+    """Return rows ``(n, ...)`` in another order, or with other signs."""
     if by.dtype.kind == "i":
         return rows[by]
     return rows * by.reshape(-1, *[1] * (rows.ndim - 1))
@@ -506,20 +500,22 @@ def rearranged(rows: np.ndarray, by: np.ndarray) -> np.ndarray:
 def scatter_test(
     coordinates: np.ndarray, x: np.ndarray, *, covariates: np.ndarray | None = None
 ) -> tuple[np.ndarray, float]:
-    """Whether shapes scatter differently with x: a test of Levene's kind (Anderson 2006).
+    """Test homogeneity of covariance by distances to the fitted values (Anderson 2006).
+
+    A multivariate Levene test.
 
     Parameters
     ----------
     coordinates : float ndarray (n, p)
-        Of the shapes on all components, in the unit of the input.
+        Scores of the shapes on all components, in the unit of the input.
     x, covariates : see :class:`Model`
 
     Returns
     -------
     distance : float ndarray (n,)
-        Of each shape from what the model expects of it, as if the model did not know the shape.
+        Norm of the leave-one-out residual of each shape.
     p : float
-        Of the F test of these distances on x; 1 where the model leaves nothing to compare.
+        p value of the F test of these distances on x; 1 without residuals.
 
     Examples
     --------
@@ -532,21 +528,21 @@ def scatter_test(
     """
     model = np.column_stack(design(x, covariates))  # (n, r + q)
     leverage = np.minimum((model**2).sum(1), 1 - 1e-9)
-    left = coordinates - model @ (model.T @ coordinates)
-    distance = np.linalg.norm(left, axis=1) / np.sqrt(1 - leverage)
+    residual = coordinates - model @ (model.T @ coordinates)
+    distance = np.linalg.norm(residual, axis=1) / np.sqrt(1 - leverage)
     if distance.max() < 1e-9 * np.linalg.norm(coordinates, axis=1).max():
         return distance, 1.0
     _, Q = design(x)
     q = Q.shape[1]
-    around = distance - distance.mean()
-    explained = ((Q.T @ around) ** 2).sum()
-    rest = max(around @ around - explained, 1e-12 * (distance @ distance))
-    dof = len(around) - 1 - q
-    return distance, float(stats.f.sf(explained / q / (rest / dof), q, dof))
+    centered = distance - distance.mean()
+    explained = ((Q.T @ centered) ** 2).sum()
+    unexplained = max(centered @ centered - explained, 1e-12 * (distance @ distance))
+    dof = len(centered) - 1 - q
+    return distance, float(stats.f.sf(explained / q / (unexplained / dof), q, dof))
 
 
 def whiten(E: np.ndarray) -> np.ndarray:
-    """Residual vectors ``(n, v, d)`` in units of their scatter W at each vertex, W^-1/2 e, or 0."""
+    """Whiten residual vectors ``(n, v, d)`` by their scatter W at each vertex: W^-1/2 e, or 0."""
     value, V = np.linalg.eigh(np.einsum("nvd,nve->vde", E, E))  # (v, d), (v, d, d)
     largest = value[:, -1:]
     is_zero = value <= 1e-10 * np.where(largest > 0, largest, 1)
@@ -555,23 +551,23 @@ def whiten(E: np.ndarray) -> np.ndarray:
 
 
 def batched(items: Iterator[Any], size: int) -> Iterator[list[Any]]:
-    """The items in lists of at most `size`."""
+    """Yield items in lists of at most `size`."""
     while batch := list(itertools.islice(items, size)):
         yield batch
 
 
 def explained_share(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Pillai's trace of whitened residuals once permuted: tr(B^T B (I - A^T A)^-1), ``(b, v)``.
+    """Return Pillai's trace of permuted, whitened residuals: tr(B^T B (I - A^T A)^-1), ``(b, v)``.
 
     Parameters
     ----------
     A : float ndarray (b, r, k, v)
-        Z^T P E: what the covariates take of permuted residuals, whose scatter was I.
+        Z^T P E: the part of permuted residuals that the covariates explain.
     B : float ndarray (b, q, k, v)
         Q^T P E.
     """
     k = A.shape[2]
-    scatter = {  # of what is left: I - A^T A, its upper triangle
+    scatter = {  # upper triangle of I - A^T A
         (i, j): (i == j) - np.einsum("brv,brv->bv", A[:, :, i], A[:, :, j], dtype=float)
         for i in range(k)
         for j in range(i, k)

@@ -1,20 +1,20 @@
-"""Statistics of a finished study (6.1): the model, groups and variables, outliers, classes.
+"""Statistics of a finished study (6.1): shape model, groups and variables, outliers, classes.
 
-All take a study and give a Dataset.  What works on plain arrays is in
+All functions take a study and return a Dataset.  Functions of plain arrays are in
 :mod:`s4a.analysis.permutation` and :mod:`s4a.analysis.model`; groups and variables are in
 :mod:`s4a.analysis.effects`.  Asymmetry, growth, fields, regions and generalization with new
 correspondences are in the extension ``s4a_morphometrics``.
 
 To add a statistic:
 
-1. ``sample_of(study, values, "group", covariates)`` takes arrays, dicts and columns of
-   ``/subjects`` alike, and gives the displacements ``d (shape, vertex, xyz)`` of the shapes that
-   have all values, the areas of the vertices and the columns of the covariates; without values,
+1. get its data by ``sample_of(study, values, "group", covariates)``, which accepts arrays, dicts
+   and columns of ``/subjects``, and returns the displacements ``d (shape, vertex, xyz)`` of the
+   shapes with all values, the vertex areas and the columns of the covariates; without values, by
    ``displacements_of(study)`` (:mod:`s4a.analysis.inputs`);
-2. its arithmetic is a function of plain arrays, tested on a known answer;
-3. its variables are in :data:`s4a.schema.TABLE`; give them as ``in_unit(dataset(...), unit)``;
-4. its name is in ``__all__`` below, its command in :mod:`s4a.cli.commands`;
-5. a test plants an effect, which is found, and none, which is not.
+2. write its arithmetic as a function of plain arrays, tested on a known answer;
+3. add its variables to :data:`s4a.schema.TABLE`; return ``in_unit(dataset(...), unit)``;
+4. add its name to ``__all__`` below, its command to :mod:`s4a.cli.commands`;
+5. test it on data with a simulated effect and under the null hypothesis.
 """
 
 from typing import TYPE_CHECKING
@@ -65,41 +65,45 @@ __all__ = [
 def outliers(
     study: xr.DataTree, *, n_components: int | None = None, level: float = 0.01
 ) -> xr.Dataset:
-    """Shapes that the model of all others describes badly, or finds far from its mean.
+    """Detect outliers by the leave-one-out error and the Mahalanobis distance of each shape.
 
     Parameters
     ----------
     study : DataTree
     n_components : int, optional
-        By default as many as hold 90 % of the variance, at most a tenth of the shapes: the more
-        there are, the more the largest of a sample lie above those of its population.
+        By default the components of 90 % of the variance, at most a tenth of the shapes, as the
+        largest variances of a sample overestimate those of the population.
     level : float
-        The most of a normal population whose Mahalanobis distance is called too large.
+        Significance level of the Mahalanobis distance.
 
     Returns
     -------
     Dataset
-        Each shape left out of the model: ``mahalanobis(shape)`` of its scores and ``outlier_p`` (F
-        distribution of a new observation, which is exact for a population of as many components and
-        too large where it has more), ``left_out_error(shape)`` in the unit of the input, and
-        ``outlier(shape)``: p under `level`, or the error more than 3.5 robust standard deviations
-        over the median (Iglewicz and Hoaglin 1993).
+        For each shape left out of the model: ``mahalanobis(shape)`` of its scores and ``outlier_p``
+        (F distribution of a new observation; exact for a population with as many components,
+        conservative for more), ``left_out_error(shape)`` in the unit of the input, and
+        ``outlier(shape)``: p below `level`, or an error more than 3.5 robust standard deviations
+        above the median (Iglewicz and Hoaglin 1993).
 
     Raises
     ------
     ValueError
-        When n_components is not a number that the shapes allow.
+        If n_components is out of range.
+
+    See Also
+    --------
+    evaluate : Measures of the whole model.
 
     Examples
     --------
-    With the ``study`` of six small brains:
+    In a study of six small brains:
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
-    >>> odd = s4a.statistics.outliers(study)
-    >>> odd["outlier"].values.any()
+    >>> result = s4a.statistics.outliers(study)
+    >>> result["outlier"].values.any()
     np.False_
-    >>> names, error = odd["shape"].values.tolist(), odd["left_out_error"].values
+    >>> names, error = result["shape"].values.tolist(), result["left_out_error"].values
     >>> s4a.show.charts.ranked(names, error, "left-out error (mm)", int(error.argmax()))
     <Figure ...>
     """
@@ -113,14 +117,15 @@ def outliers(
     squared = np.nansum(score[:, :c] ** 2, axis=1)
     n = s - 1
     p = stats.f.sf(squared * n * (n - c) / (c * (n * n - 1)), c, n - c)
-    spread = stats.median_abs_deviation(error, scale="normal")
-    is_strange = (spread > 0) & (error - np.median(error) > 3.5 * max(spread, 1e-12 * error.max()))
+    deviation = stats.median_abs_deviation(error, scale="normal")
+    limit = 3.5 * max(deviation, 1e-12 * error.max())
+    has_large_error = (deviation > 0) & (error - np.median(error) > limit)
     result = dataset(
         {"components": c, "correspondence": KEPT, "level": level},
         mahalanobis=np.sqrt(squared),
         outlier_p=p,
         left_out_error=error,
-        outlier=(p < level) | is_strange,
+        outlier=(p < level) | has_large_error,
     )
     result = in_unit(result, unit_of(registration["displacement"]))
     return result.assign_coords(shape=registration["shape"].values)
@@ -137,13 +142,10 @@ def classify(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """Can the groups be told from the shapes?
+    """Classify shapes into groups, with cross-validation and a permutation test.
 
-    Cross-validated, with the modes made inside every fold.
-
-    The coordinates of all shapes on all components are an isometric image of the displacements, so
-    that PCA of the training shapes' coordinates is PCA of their displacements; nothing of a
-    left-out shape enters the modes, their scaling or the estimator.
+    PCA, scaling and estimator are fitted to the training shapes of each fold.  PCA of their scores
+    on all components equals PCA of their displacements, as the scores are isometric.
 
     Parameters
     ----------
@@ -152,11 +154,11 @@ def classify(
     estimator : scikit-learn classifier, optional
         Logistic regression by default; it is cloned.
     n_components : int, optional
-        As in :func:`group_test`, at most what the training shapes carry.
+        As in :func:`group_test`, at most two fewer than training shapes.
     n_folds : int
-        Stratified; at most the size of the smallest group.
+        Stratified folds; at most the size of the smallest group.
     n_permutations : int
-        Of the groups, for the p value.
+        Permutations of the groups for the p value.
     seed, rng : see :mod:`s4a.seeds`
 
     Returns
@@ -168,11 +170,15 @@ def classify(
     Raises
     ------
     ValueError
-        When a group has fewer than 3 shapes, or an option is out of range.
+        If a group has fewer than 3 shapes, or an option is out of range.
+
+    See Also
+    --------
+    group_test : Test whether the means of groups differ.
 
     Examples
     --------
-    With the ``study`` of six small brains, split at random:
+    In a study of six small brains, with random groups:
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
@@ -194,8 +200,8 @@ def classify_sample(
     n_permutations: int,
     seed: int,
 ) -> xr.Dataset:
-    """Classify as :func:`classify` does."""
-    # here, as nothing else needs scikit-learn
+    """Classify a sample, see :func:`classify`."""
+    # imported here, as nothing else needs scikit-learn
     from sklearn.base import clone
     from sklearn.decomposition import PCA
     from sklearn.linear_model import LogisticRegression
@@ -205,7 +211,7 @@ def classify_sample(
     from sklearn.preprocessing import StandardScaler
 
     if n_folds < 2:
-        raise ValueError(f"n_folds needs a number from 2, found {n_folds}")
+        raise ValueError(f"n_folds must be at least 2; found {n_folds}")
     group, sizes = sample.values, group_sizes(sample.values)
     names, count = np.unique(group, return_counts=True)
     n_folds = min(n_folds, int(count.min()))
@@ -229,7 +235,7 @@ def classify_sample(
         "permutations": n_permutations,
         "smallest_p": Model(indicators(group)[1], n_permutations=n_permutations).smallest_p,
         "groups": sizes,
-        "left_out": sample.said["left_out"],
+        "left_out": sample.attributes["left_out"],
         "balanced_accuracy": float(balanced_accuracy_score(group, predicted)),
         "chance": 1 / len(names),
         "components": c,

@@ -1,13 +1,13 @@
 """Transfer of labels, landmarks and scalar fields along a registration (6.2, 4.3; Fig. 6 and 7).
 
 Routes go from the template to a shape, from a shape through the template to another, or from an
-external mesh to the template of a study and on to every shape.  A route is a list of links between
-a template and a shape, with their directions:
+external mesh through the template of a study to every shape.  A route is a list of links between a
+template and a shape, with their directions:
 
     source shape --up--> template --down--> target shape
 
-Down a link every vertex of the shape takes the values at the closest point of the deformed
-template; up, every vertex of the template takes those at the closest point of the shape.
+Down a link, every vertex of the shape gets the value at the closest point of the deformed template;
+up, every vertex of the template gets the value at the closest point of the shape.
 """
 
 from collections.abc import Iterator
@@ -42,21 +42,19 @@ from s4a.study.pair import match_shapes, shape_of
 from s4a.study.processes import workers
 from s4a.study.tree import stack_registration, template_mesh
 
-# how far votes for labels count, by what the study leaves out
-BLURS = {None: 1.0, "fast": 1.0, "paper": 0.0}
+BLURS = {None: 1.0, "fast": 1.0, "paper": 0.0}  # default of `blur` by preset
 
-
-# Triangle (p,) and barycentric weights (p, 3) of points on a surface, and how sure they are (p,).
-Places = tuple[np.ndarray, np.ndarray, np.ndarray]
+# Triangles (p,) and barycentric weights (p, 3) of points on a surface, and their confidence (p,).
+Points = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Link:
-    """One registration: a template ``X, T``, a shape ``Y, S``, and where one is on the other.
+    """One registration: a template ``X, T``, a shape ``Y, S``, and their correspondence.
 
-    ``image (n, 3)`` is the registered template in the shape's frame, ``confidence (n,)`` that of
-    its vertices; ``triangle (p,)`` and ``weights (p, 3)`` are the places of the shape's vertices on
-    the template.
+    ``image (n, 3)`` is the registered template in the frame of the shape, ``confidence (n,)`` that
+    of its vertices; ``triangle (p,)`` and ``weights (p, 3)`` are the barycentric coordinates of the
+    shape's vertices on the template.
     """
 
     X: np.ndarray
@@ -78,39 +76,40 @@ class Link:
     def up(self) -> tuple[sp.csr_matrix, np.ndarray]:
         """Matrix ``(n, p)`` of values from shape to template, and confidence on the template."""
         normals = vertex_normals(self.image, self.T)
-        place = closest_facing_point(self.image, normals, self.Y, self.S)
-        return interpolation_matrix(self.S, *place, len(self.Y)), self.confidence
+        triangle, weights = closest_facing_point(self.image, normals, self.Y, self.S)
+        return interpolation_matrix(self.S, triangle, weights, len(self.Y)), self.confidence
 
-    def transfer_down(self, triangle: np.ndarray, weights: np.ndarray) -> Places:
-        """Places on the shape of points on the template."""
-        place = (self.T, triangle, weights)
-        P = interpolate(self.image, *place)
-        N = interpolate(vertex_normals(self.image, self.T), *place)
-        confidence = interpolate(self.confidence[:, None], *place)[:, 0]
+    def transfer_down(self, triangle: np.ndarray, weights: np.ndarray) -> Points:
+        """Transfer points on the template to the shape."""
+        points = (self.T, triangle, weights)
+        P = interpolate(self.image, *points)
+        N = interpolate(vertex_normals(self.image, self.T), *points)
+        confidence = interpolate(self.confidence[:, None], *points)[:, 0]
         return *closest_facing_point(P, N, self.Y, self.S), confidence
 
-    def transfer_up(self, triangle: np.ndarray, weights: np.ndarray) -> Places:
-        """Places on the template of points on the shape."""
+    def transfer_up(self, triangle: np.ndarray, weights: np.ndarray) -> Points:
+        """Transfer points on the shape to the template."""
         P = interpolate(self.Y, self.S, triangle, weights)
         N = interpolate(vertex_normals(self.Y, self.S), self.S, triangle, weights)
-        place = closest_facing_point(P, N, self.image, self.T)
-        return *place, interpolate(self.confidence[:, None], self.T, *place)[:, 0]
+        triangle, weights = closest_facing_point(P, N, self.image, self.T)
+        confidence = interpolate(self.confidence[:, None], self.T, triangle, weights)[:, 0]
+        return triangle, weights, confidence
 
 
-Route = list[tuple[Link, str]]  # ends with "down" or "up"
+Route = list[tuple[Link, str]]  # links with their directions, "down" or "up"
 
 
 def image_in_shape(X: np.ndarray, registered: xr.Dataset) -> np.ndarray:
-    """Positions ``(n, 3)`` of the registered template where the file of the shape has the shape.
+    """Return the registered template ``(n, 3)`` in the coordinates of the shape's file.
 
-    `registered` is the shape's part of ``/registration``, x -> s R x + t its way to the template.
+    `registered` is the shape's part of ``/registration``, with the alignment s R x + t.
     """
     R, t, s = (registered[name].values for name in ("rotation", "translation", "scale"))
     return (X + registered["displacement"].values - t) @ R / s
 
 
 def link(template: xr.Dataset, shape: xr.Dataset, registered: xr.Dataset) -> Link:
-    """The :class:`Link` of two meshes, by the shape's part of ``/registration``."""
+    """Return the :class:`Link` of two meshes from the shape's part of ``/registration``."""
     X, T = as_arrays(template)
     Y, S = as_arrays(shape)
     names = ("confidence", "template_triangle", "template_barycentric")
@@ -118,35 +117,29 @@ def link(template: xr.Dataset, shape: xr.Dataset, registered: xr.Dataset) -> Lin
 
 
 def matrix_along(route: Route, n: int) -> tuple[sp.csr_matrix, np.ndarray]:
-    """Matrix and confidence of a route.
-
-    The matrix goes from values on its first mesh, of n vertices, to those on its last, where the
-    confidence is.
-    """
+    """Return the matrix of a route from n vertices, and the confidence on the last mesh."""
     if not route:
         return sp.identity(n, format="csr"), np.ones(n)
-    steps = [getattr(step, way) for step, way in route]
+    steps = [getattr(step, direction) for step, direction in route]
     W, confidence = steps[0]
-    for V, own in steps[1:]:
+    for V, confidence_of_step in steps[1:]:
         W = V @ W
-        confidence = own * (V @ confidence)
+        confidence = confidence_of_step * (V @ confidence)
     return W, confidence
 
 
-def transfer_along(route: Route, triangle: np.ndarray, weights: np.ndarray) -> Places:
-    """Places on the last mesh of points on the first."""
+def transfer_along(route: Route, triangle: np.ndarray, weights: np.ndarray) -> Points:
+    """Transfer points from the first mesh of a route to the last."""
     confidence = np.ones(len(triangle))
-    for step, way in route:
-        triangle, weights, own = getattr(step, f"transfer_{way}")(triangle, weights)
-        confidence = confidence * own
+    for step, direction in route:
+        transfer = step.transfer_down if direction == "down" else step.transfer_up
+        triangle, weights, confidence_of_step = transfer(triangle, weights)
+        confidence = confidence * confidence_of_step
     return triangle, weights, confidence
 
 
 def blend_routes(routes: list[Route], n: int) -> tuple[sp.csr_matrix, np.ndarray]:
-    """The mean of several routes, weighted by their confidence at every vertex.
-
-    Matrix ``(p, n)``, and mean confidence ``(p,)``.
-    """
+    """Average routes, weighted by confidence: matrix ``(p, n)`` and mean confidence ``(p,)``."""
     matrices, confidences = zip(*(matrix_along(route, n) for route in routes), strict=True)
     weight = np.stack(confidences) + 1e-9  # (routes, p), no zero in the sum below
     weight /= weight.sum(0)
@@ -155,7 +148,7 @@ def blend_routes(routes: list[Route], n: int) -> tuple[sp.csr_matrix, np.ndarray
 
 
 def votes_of(W: sp.csr_matrix, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Votes of the source's vertices for every label at every target vertex.
+    """Return the votes of the source vertices for every label at every target vertex.
 
     Parameters
     ----------
@@ -173,11 +166,11 @@ def votes_of(W: sp.csr_matrix, label: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return (W @ one_hot).toarray().astype(np.float32), value
 
 
-def spread_votes(vote: np.ndarray, X: np.ndarray, T: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Votes after a short step of heat: (A + W) v = A v0, W stiffness with t = area radius^2 / 4.
+def diffuse_votes(vote: np.ndarray, X: np.ndarray, T: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Diffuse votes by an implicit heat step, (A + W) v = A v0, over the uncertainty of the match.
 
-    What votes at a vertex votes around it, too, as far as its match may be wrong; A has the areas
-    of the vertices.  The kernel of one implicit step has a mean squared radius of 4 t in the plane.
+    A are the vertex areas, W is the stiffness matrix times t = area radius^2 / 4.  In the plane the
+    kernel of one step has a mean squared radius of 4 t.
 
     Parameters
     ----------
@@ -185,7 +178,7 @@ def spread_votes(vote: np.ndarray, X: np.ndarray, T: np.ndarray, radius: np.ndar
     X, T : ndarray (p, 3), (q, 3)
         The target.
     radius : ndarray (p,)
-        Root of the mean squared radius, as a share of sqrt(area).
+        Root mean squared radius, as a share of sqrt(area).
 
     Returns
     -------
@@ -194,52 +187,52 @@ def spread_votes(vote: np.ndarray, X: np.ndarray, T: np.ndarray, radius: np.ndar
     """
     E, w, area, _ = laplacian(X, T, vertex_areas(X, T))
     t = area.sum() * radius**2 / 4
-    # edges between obtuse corners, whose weights are negative, would make votes so
+    # negative weights of edges between obtuse corners would give negative votes
     W = stiffness(E, np.maximum(w, 0) * t[E].mean(axis=1), len(X))
     system = sp.diags(area) + W  # (p, p), positive definite
     jacobi = sp.diags(1 / system.diagonal())
-    spread = vote.copy()
-    for column in spread.T:
+    diffused = vote.copy()
+    for column in diffused.T:
         v = column.astype(float)
         column[:] = cg(system, area * v, x0=v, rtol=1e-5, M=jacobi)[0]
-    np.clip(spread, 0, 1, out=spread)  # as conjugate gradients are exact to 1e-5
-    spread /= spread.sum(axis=1, keepdims=True)
-    return spread
+    np.clip(diffused, 0, 1, out=diffused)  # as conjugate gradients are exact to 1e-5
+    diffused /= diffused.sum(axis=1, keepdims=True)
+    return diffused
 
 
-def elect(vote: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """The label with most votes at every vertex; the first in sorted order among equals.
+def majority(vote: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Return the label with most votes at every vertex; ties give the first in sorted order.
 
     Examples
     --------
     >>> import numpy as np
     >>> import scipy.sparse as sp
-    >>> from s4a.analysis.transfer import elect, votes_of
-    >>> elect(*votes_of(sp.csr_matrix([[0.5, 0.2, 0.3]]), np.array([4, 7, 7]))).tolist()
+    >>> from s4a.analysis.transfer import majority, votes_of
+    >>> majority(*votes_of(sp.csr_matrix([[0.5, 0.2, 0.3]]), np.array([4, 7, 7]))).tolist()
     [4]
     """
-    return value[vote.round(6).argmax(1)]  # equal votes are equal to six digits
+    return value[vote.round(6).argmax(1)]  # votes within six digits are ties
 
 
 def pair_study(result: xr.Dataset, source: xr.Dataset, target: xr.Dataset) -> xr.DataTree:
-    """The result of :func:`s4a.match_pair` as a study of ``source`` and ``target``, the template.
+    """Convert a result of :func:`s4a.match_pair` to a study, with the target as template.
 
     Parameters
     ----------
     result, source, target : Dataset
-        The result, and the meshes it was made of.
+        The result, and the two meshes.
 
     Returns
     -------
     DataTree
-        ``/original``, ``/registration``: what the functions of this module take.
+        ``/original``, ``/registration``, for the functions of this module.
     """
     registered = result.rename(match="registered_match")
     return _study_of("target", target, {"source": source}, {"source": registered}, {})
 
 
 def _study_of(name, template, shapes, forth, back):
-    """A registered study; `forth` has the registrations of the shapes, `back` of the template."""
+    """Registered study; `forth` are registrations of the shapes, `back` of the template."""
     meshes = {name: template, **shapes}
     nodes = {f"original/{n}": mesh for n, mesh in meshes.items()}
     files = {name: identity(Shape(template)), **forth}
@@ -248,13 +241,13 @@ def _study_of(name, template, shapes, forth, back):
 
 
 def _shape_of(mesh, options):
-    """The shape of a mesh, with its low resolution and spectrum."""
+    """Shape of a mesh, with low resolution and spectrum."""
     with threadpool_limits(1):
         return shape_of(mesh, options)
 
 
 def _match_both(shape, template, options):
-    """The shape registered to the template and, with `bidirectional`, the template to the shape."""
+    """Register the shape to the template and, with `bidirectional`, the template to the shape."""
     with threadpool_limits(1):
         forth = match_shapes(shape, template, options)[0]
         return forth, match_shapes(template, shape, options)[0] if options.bidirectional else None
@@ -269,7 +262,7 @@ def register_pairs(
     preset: str | None = None,
     **options: Any,
 ) -> xr.DataTree:
-    """The template registered to each shape on its own (6.2, the first way): a study for transfer.
+    """Register a template to each shape without a network (6.2), for transfer.
 
     Parameters
     ----------
@@ -277,15 +270,15 @@ def register_pairs(
         Mesh file, or clean mesh, such as :func:`s4a.read_shape` returns.
     shapes : dict of str to path or Dataset
     name : str
-        Of the template among the shapes.
+        Name of the template.
     n_jobs : int, optional
         As in joblib; the result does not depend on it.
     preset : {None, "paper", "fast"}
-        As of :func:`s4a.match_pair`; ``"paper"`` sets bidirectional=False, too, and blur=0 of
+        See :func:`s4a.match_pair`; ``"paper"`` also sets bidirectional=False, and blur=0 of
         :func:`s4a.transfer_labels`.
     **options
-        Those of :func:`s4a.match_pair`, and ``bidirectional``: whether each pair is matched both
-        ways, as by default; transfer then takes the mean of both.  See :class:`s4a.Options`.
+        Options of :func:`s4a.match_pair`, and ``bidirectional``: whether each pair is matched in
+        both directions (default), so that transfer averages both.  See :class:`s4a.Options`.
 
     Returns
     -------
@@ -295,8 +288,14 @@ def register_pairs(
     Raises
     ------
     ValueError
-        When a shape has the name of the template, a mesh lacks its variables, or an option is
-        outside its range or contradicts the preset.
+        If a shape has the name of the template, a mesh lacks a variable, or an option is out of
+        range or contradicts the preset.
+
+    See Also
+    --------
+    s4a.match_pair : Register one pair.
+    s4a.analyse : Register a collection by a network.
+    s4a.transfer_labels, s4a.transfer_scalars, s4a.transfer_landmarks : Use the registrations.
 
     Examples
     --------
@@ -311,7 +310,8 @@ def register_pairs(
     check_type(shapes, dict, "shapes")
     if name in shapes or not shapes:
         raise ValueError(
-            f"shapes other than the template, {name!r}, needed; found {', '.join(shapes) or 'none'}"
+            f"shapes other than the template {name!r} are needed; found "
+            f"{', '.join(shapes) or 'none'}"
         )
     meshes = {n: as_mesh(mesh, f"mesh {n}") for n, mesh in {name: template, **shapes}.items()}
     settings = given_options({"preset": preset, **options}, pair=True)
@@ -330,7 +330,7 @@ def register_pairs(
 
 
 def _preset(study: xr.DataTree, given: dict[str, Any]) -> str | None:
-    """The preset of a transfer: the given one, else that of the study or of its pairs."""
+    """Preset of a transfer: the given one, else that of the study or of its pairs."""
     if "preset" in given:
         return given["preset"]
     if "report" in study.children:
@@ -339,9 +339,9 @@ def _preset(study: xr.DataTree, given: dict[str, Any]) -> str | None:
 
 
 def _routes(study: xr.DataTree, name: str) -> tuple[list[Route], list[Route]]:
-    """Routes from the template down to a shape, and from the shape up to it.
+    """Routes from the template down to a shape, and up from the shape.
 
-    One each way, or two where the pair was matched both ways.
+    One in each direction, or two if the pair was matched in both directions.
     """
     registration = study["registration"].to_dataset()
     template = registration.attrs["template"]
@@ -349,8 +349,8 @@ def _routes(study: xr.DataTree, name: str) -> tuple[list[Route], list[Route]]:
         return [[]], [[]]
     mesh = study["original"][template].to_dataset()
     shape = study["original"][name].to_dataset()
-    places = study["registration"].children[name].to_dataset(inherit=False)
-    forth = link(mesh, shape, registration.sel(shape=name).merge(places))
+    points = study["registration"].children[name].to_dataset(inherit=False)
+    forth = link(mesh, shape, registration.sel(shape=name).merge(points))
     down: list[Route] = [[(forth, "down")]]
     up: list[Route] = [[(forth, "up")]]
     if "reverse" in study.children and name in study["reverse"].children:
@@ -363,17 +363,17 @@ def _routes(study: xr.DataTree, name: str) -> tuple[list[Route], list[Route]]:
 def _routes_from_outside(
     study: xr.DataTree, mesh: xr.Dataset, given: dict[str, Any]
 ) -> list[Route]:
-    """Routes from an external mesh to the study's template, by its options and those given."""
+    """Routes from an external mesh to the template of a study, with its options and given ones."""
     name = study["registration"].attrs["template"]
     if "coarse" not in study.children:
         raise ValueError(
-            f"a source that is none of the shapes is matched to the template {name!r}, which needs "
-            "/coarse; this study of pairs has none: give one of its shapes"
+            f"an external source is matched to the template {name!r}, which needs /coarse; this "
+            "study of pairs has none: give one of its shapes as source"
         )
     template = study["original"][name].to_dataset().load()
-    own = Options.from_report(study)
-    options = given_options(given, own, pair=True)
-    if options.of("low resolution") == own.of("low resolution"):
+    of_study = Options.from_report(study)
+    options = given_options(given, of_study, pair=True)
+    if options.of("low resolution") == of_study.of("low resolution"):
         inside = Shape(
             template, study["coarse"][name].to_dataset().load(), **options.of("projection")
         )
@@ -396,19 +396,19 @@ def plan(
     targets: list[str] | None,
     options: dict[str, Any] | None = None,
 ) -> tuple[xr.Dataset, Targets]:
-    """The mesh where the transfer begins, and an iterator of (target, its mesh, routes to it).
+    """Return the source mesh, and an iterator of (target name, mesh, routes to it).
 
     Parameters
     ----------
     study, source, targets : see :func:`transfer_labels`
     options : dict, optional
-        Of a pair, by which an external source is matched, beside those of the study.
+        Options of the match of an external source, which replace those of the study.
 
     Raises
     ------
     ValueError
-        When the study has no registration, a shape is not in it, or there are options and nothing
-        is matched.
+        If the study has no registration or lacks a shape, or options are given without an external
+        source.
     """
     registration = all_registered(study)
     template = registration.attrs["template"]
@@ -416,30 +416,29 @@ def plan(
     source = template if source is None else source
     external = isinstance(source, xr.Dataset)
     targets = [n for n in names if external or n != source] if targets is None else list(targets)
-    asked = targets if external or source == template else [*targets, source]
-    wrong = [n for n in asked if n not in names]
-    if wrong:
+    needed = targets if external or source == template else [*targets, source]
+    unknown = [n for n in needed if n not in names]
+    if unknown:
         raise ValueError(
-            f"no shape {', '.join(map(repr, wrong))} in the study; it has {', '.join(names)}"
+            f"no shape {', '.join(map(repr, unknown))} in the study; it has {', '.join(names)}"
         )
     if isinstance(source, xr.Dataset):
         require(source, "position", "corner_vertex", what="source")
-        mesh, first = source, _routes_from_outside(study, source, options or {})
+        mesh, up = source, _routes_from_outside(study, source, options or {})
     elif options:
         raise ValueError(
-            f"options {', '.join(options)} need a source that is none of the shapes, which is "
-            f"matched to the template; found the shape {source!r}, which is registered: leave "
-            "them out"
+            f"options {', '.join(options)} need an external source, which is matched to the "
+            f"template; found the shape {source!r}, which is registered: leave them out"
         )
     else:
-        mesh, first = study["original"][source].to_dataset(), _routes(study, source)[1]
+        mesh, up = study["original"][source].to_dataset(), _routes(study, source)[1]
 
-    def each():
+    def routes_to_targets():
         for name in targets:
-            last, _ = _routes(study, name)
-            yield name, study["original"][name].to_dataset(), [a + b for a in first for b in last]
+            down, _ = _routes(study, name)
+            yield name, study["original"][name].to_dataset(), [a + b for a in up for b in down]
 
-    return mesh, each()
+    return mesh, routes_to_targets()
 
 
 def transfer_labels(
@@ -452,58 +451,63 @@ def transfer_labels(
     blur: float | None = None,
     **options: Any,
 ) -> xr.DataTree:
-    """Labels of one mesh on every shape of a registered study (6.2, Fig. 6).
+    """Transfer labels of one mesh to every shape of a registered study (6.2, Fig. 6).
 
     Parameters
     ----------
     study : DataTree
-        A finished study, or what :func:`register_pairs` or :func:`pair_study` gives.
+        A finished study, or a result of :func:`register_pairs` or :func:`pair_study`.
     label : array_like (vertex,)
-        Of the vertices of the source in ``/original`` (see
-        :func:`s4a.input.annotations.labels_of_mesh`); numbers or names.
+        Numbers or names at the vertices of the source in ``/original`` (see
+        :func:`s4a.input.annotations.labels_of_mesh`).
     source : str or Dataset, optional
-        A shape of the study, by default its template; or an external mesh, which is matched to the
-        template first (template -> median -> every shape), by the options of the study.
+        A shape of the study, by default the template; or an external mesh, which is first matched
+        to the template with the options of the study.
     targets : list of str, optional
         All other shapes by default.
     votes : bool
-        Whether the share of every label is given too.
+        Whether to return the share of every label.
     blur : float, optional
-        How far votes count around the place where they fall, in multiples of how far the match may
-        be wrong there by its confidence (:func:`s4a.method.register.uncertainty`): where it is
-        sure, borders between labels stay where they fall, elsewhere they come out smooth.  A label
-        that would win nowhere for it keeps the vertices that it has without.  With 0, as in the
-        paper, votes count where they fall.  By default 1, and 0 where the study, or the source that
-        is matched to it, has ``preset="paper"``.
+        Radius over which votes are diffused, in multiples of the uncertainty of the match
+        (:func:`s4a.method.register.uncertainty`), so that label borders are smooth where the match
+        is uncertain.  A label that diffusion would remove keeps its vertices.  0, as in the paper,
+        disables diffusion.  The default is 1, or 0 with ``preset="paper"`` of the study or of an
+        external source.
     **options
-        Of an external source alone: those of :func:`register_pairs`, ``preset`` among them, in the
-        place of the study's.
+        For an external source: options of :func:`register_pairs`, including ``preset``, which
+        replace those of the study.
 
     Returns
     -------
     DataTree
         For every target ``label(vertex)``, the label with most votes among the corners of the
-        triangle that each vertex comes to lie on, and those around; ``label_share(vertex)``, its
-        share of the votes;
-        ``confidence(vertex)`` of the match; and with `votes` ``label_vote(vertex, label_value)``.
+        corresponding triangle and their neighbourhood; ``label_share(vertex)``, its share of the
+        votes; ``confidence(vertex)`` of the match; and with `votes`
+        ``label_vote(vertex, label_value)``.
 
     Raises
     ------
     ValueError
-        When the labels do not fit the source, a shape is not in the study, the blur is below 0 or
-        above 10, or an option is given where nothing is matched, is outside its range or
-        contradicts the preset.
+        If the labels do not fit the source, a shape is not in the study, `blur` is not within 0 and
+        10, or an option is out of range, contradicts the preset, or is given without an external
+        source.
+
+    See Also
+    --------
+    s4a.transfer_scalars : Scalar fields.
+    s4a.transfer_landmarks : Landmarks.
+    s4a.write_label_volumes : Labels as volumes.
 
     Examples
     --------
-    With the ``study`` of six small brains, where the labels of every brain are known:
+    In a study of six small brains with known labels:
 
     >>> import numpy as np
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
     >>> label, true = (study[f"original/{name}/label"].values for name in ("brain_01", "brain_02"))
-    >>> carried = s4a.transfer_labels(study, label, source="brain_01", targets=["brain_02"])
-    >>> bool((carried["brain_02/label"].values == true).mean() > 0.5)
+    >>> result = s4a.transfer_labels(study, label, source="brain_01", targets=["brain_02"])
+    >>> bool((result["brain_02/label"].values == true).mean() > 0.5)
     True
 
     Labels of one brain on another, in colours:
@@ -512,38 +516,38 @@ def transfer_labels(
     >>> source, target = (mesh.to_dataset() for mesh in brains.children.values())
     >>> pairs = s4a.register_pairs(source, {"b": target}, n_coarse=600, k=40)
     >>> label = source["label"].values
-    >>> found = s4a.transfer_labels(pairs, label)["b/label"].values
+    >>> transferred = s4a.transfer_labels(pairs, label)["b/label"].values
     >>> colors = s4a.show.draw.label_colors(np.arange(label.max() + 1))
     >>> s4a.show.charts.surfaces(
-    ...     {"template": source, "carried": target},
-    ...     {"template": colors[label], "carried": colors[found]},
+    ...     {"template": source, "transferred": target},
+    ...     {"template": colors[label], "transferred": colors[transferred]},
     ...     flat=True,
     ... )
-    <Parts ...>
+    <TiledFigure ...>
     """
     if blur is not None and not 0 <= blur <= 10:
         raise ValueError(f"blur needs a factor from 0 to 10; found {blur}")
-    mesh, each = plan(study, source, targets, options)
+    mesh, routes_to_targets = plan(study, source, targets, options)
     blur = BLURS[_preset(study, options)] if blur is None else blur
     label = _per_vertex(label, mesh, "label")
-    carried = {}
-    for name, target, routes in each:
+    transferred = {}
+    for name, target, routes in routes_to_targets:
         W, confidence = blend_routes(routes, len(label))
         vote, value = votes_of(W, label)
-        winner = elect(vote, value)
-        if blur and any(routes):  # to the source itself there is no way, nor flag
-            vote = spread_votes(vote, *as_arrays(target), blur * uncertainty(confidence))
-            spread = elect(vote, value)
-            lost = np.setdiff1d(winner, spread)
-            winner = np.where(np.isin(winner, lost), winner, spread)
+        winner = majority(vote, value)
+        if blur and any(routes):  # the source itself has an empty route, without uncertainty
+            vote = diffuse_votes(vote, *as_arrays(target), blur * uncertainty(confidence))
+            diffused = majority(vote, value)
+            lost = np.setdiff1d(winner, diffused)
+            winner = np.where(np.isin(winner, lost), winner, diffused)
         share = vote[np.arange(len(vote)), np.searchsorted(value, winner)]
-        carried[name] = dataset(
+        transferred[name] = dataset(
             label=winner, label_share=share, confidence=confidence.astype(np.float32)
         )
         if votes:
             shares = dataset(label_vote=vote)
-            carried[name] = carried[name].merge(shares).assign_coords(label_value=value)
-    return xr.DataTree.from_dict(carried)
+            transferred[name] = transferred[name].merge(shares).assign_coords(label_value=value)
+    return xr.DataTree.from_dict(transferred)
 
 
 def transfer_scalars(
@@ -554,53 +558,58 @@ def transfer_scalars(
     targets: list[str] | None = None,
     **options: Any,
 ) -> xr.DataTree:
-    """A scalar field of one mesh on every shape of a registered study, linear inside triangles.
+    """Transfer a scalar field of one mesh to every shape of a study, linearly within triangles.
 
     Parameters
     ----------
     study, source, targets, **options : see :func:`transfer_labels`
     field : array_like (vertex,)
-        In any unit; where it is NaN only the other corners of a triangle count.
+        In any unit; NaN has no weight.
 
     Returns
     -------
     DataTree
-        For every target ``field(vertex)``, NaN where over half of the weight is on NaN, and
+        For every target ``field(vertex)``, NaN if over half of the weight is on NaN, and
         ``confidence(vertex)``.
+
+    See Also
+    --------
+    s4a.transfer_labels : Labels.
+    s4a.transfer_landmarks : Landmarks.
 
     Examples
     --------
-    With the ``study`` of six small brains; what is constant stays so:
+    In a study of six small brains, a constant field stays constant:
 
     >>> import numpy as np
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
-    >>> carried = s4a.transfer_scalars(study, np.ones(200), targets=["brain_02"])
-    >>> bool(np.allclose(carried["brain_02/field"], 1))
+    >>> result = s4a.transfer_scalars(study, np.ones(200), targets=["brain_02"])
+    >>> bool(np.allclose(result["brain_02/field"], 1))
     True
     """
-    mesh, each = plan(study, source, targets, options)
+    mesh, routes_to_targets = plan(study, source, targets, options)
     field = _per_vertex(field, mesh, "field").astype(float)
-    carried = {}
-    for name, _, routes in each:
+    transferred = {}
+    for name, _, routes in routes_to_targets:
         value, confidence = _blend_field(routes, field)
-        carried[name] = dataset(field=value, confidence=confidence.astype(np.float32))
-    return xr.DataTree.from_dict(carried)
+        transferred[name] = dataset(field=value, confidence=confidence.astype(np.float32))
+    return xr.DataTree.from_dict(transferred)
 
 
 def on_template(study: xr.DataTree, name: str, field: np.ndarray) -> np.ndarray:
-    """A scalar field of a shape ``(vertex,)`` on the vertices of the template.
+    """Transfer a scalar field of a shape ``(vertex,)`` to the template.
 
-    As :func:`transfer_scalars` from the shape to the template; of the template, it stays.
+    As :func:`transfer_scalars`; a field of the template is unchanged.
     """
     return _blend_field(_routes(study, name)[1], field)[0]
 
 
 def _blend_field(routes, field):
-    """A field at the end of routes, NaN where over half of the weight is on NaN; confidence."""
-    known = np.isfinite(field).astype(float)
+    """Transferred field, NaN if over half of the weight is on NaN, and confidence."""
+    finite = np.isfinite(field).astype(float)
     W, confidence = blend_routes(routes, len(field))
-    weight = W @ known  # of the corners that are not NaN
+    weight = W @ finite
     value = W @ np.nan_to_num(field) / np.maximum(weight, 1e-12)
     value[weight < 0.5] = np.nan
     return value, confidence
@@ -611,7 +620,7 @@ def _per_vertex(values, mesh, what):
     if values.shape != (mesh.sizes["vertex"],):
         raise ValueError(
             f"{what} needs one value for each of the {mesh.sizes['vertex']} vertices of the "
-            f"source, found shape {values.shape}"
+            f"source; found shape {values.shape}"
         )
     return values
 
@@ -625,17 +634,16 @@ def transfer_landmarks(
     farthest: float = FARTHEST_LANDMARK,
     **options: Any,
 ) -> xr.DataTree:
-    """Landmarks of one mesh on every shape of a registered study, inside triangles (6.2, Fig. 7).
+    """Transfer landmarks of one mesh to every shape of a registered study (6.2, Fig. 7).
 
-    Where the landmarks have curves (``landmark_curve``, see
-    :func:`s4a.input.annotations.read_landmarks`), points in between are added along the surface of
-    the source, an edge's length apart, and all carried over: curves come out as polylines.
+    Curves of landmarks (``landmark_curve``, see :func:`s4a.input.annotations.read_landmarks`) are
+    sampled along the surface of the source at the mean edge length, and become polylines.
 
     Parameters
     ----------
     study, source, targets, **options : see :func:`transfer_labels`
     landmarks : path or Dataset
-        A landmark file, or what :func:`s4a.input.annotations.read_landmarks` returns.
+        A landmark file, or a result of :func:`s4a.input.annotations.read_landmarks`.
     farthest : float
         See :func:`s4a.input.landmarks.locate`.
 
@@ -644,72 +652,77 @@ def transfer_landmarks(
     DataTree
         For every target ``landmark_name``, ``landmark_position(landmark, xyz)`` on its surface, in
         its coordinates, ``landmark_triangle``, ``landmark_barycentric(landmark, corner)``,
-        ``landmark_confidence`` and, where there are several routes, ``landmark_disagreement``, the
-        largest distance of one from their mean; with curves ``landmark_curve`` and
-        ``landmark_closed``, and no name for the points in between.
+        ``landmark_confidence`` and, with several routes, ``landmark_disagreement``, the largest
+        distance of a route from their mean; with curves ``landmark_curve`` and
+        ``landmark_closed``, and empty names of added points.
 
     Raises
     ------
     ValueError
-        When a landmark is not on the source, a shape is not in the study, or an option does not
-        fit, as in :func:`transfer_labels`.
+        If a landmark is not on the source, a shape is not in the study, or an option is invalid,
+        see :func:`transfer_labels`.
+
+    See Also
+    --------
+    s4a.transfer_labels : Labels.
+    s4a.transfer_scalars : Scalar fields.
 
     Examples
     --------
-    With the ``study`` of six small brains:
+    In a study of six small brains:
 
     >>> import numpy as np
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
     >>> source = study["original/brain_01"].to_dataset()
     >>> landmarks = source[["landmark_name", "landmark_position"]]
-    >>> carried = s4a.transfer_landmarks(study, landmarks, source="brain_01", targets=["brain_02"])
-    >>> carried["brain_02/landmark_position"].dims
+    >>> result = s4a.transfer_landmarks(study, landmarks, source="brain_01", targets=["brain_02"])
+    >>> result["brain_02/landmark_position"].dims
     ('landmark', 'xyz')
 
-    Those of the one, and on the other where they were carried:
+    The landmarks of the source, and their transfer to the target:
 
     >>> from s4a.show.draw import label_colors, with_balls
     >>> shown, colors = {}, {}
-    >>> for name, found in (("brain_01", landmarks), ("brain_02", carried["brain_02"])):
+    >>> for name, marks in (("brain_01", landmarks), ("brain_02", result["brain_02"])):
     ...     X, T = s4a.geometry.mesh.as_arrays(study[f"original/{name}"].to_dataset())
-    ...     places = found["landmark_position"].values
-    ...     hues, radii = label_colors(np.arange(len(places))), np.full(len(places), 5.0)
-    ...     Y, S, colors[name] = with_balls(X, T, None, np.c_[places, hues, radii].tolist())
+    ...     points = marks["landmark_position"].values
+    ...     hues, radii = label_colors(np.arange(len(points))), np.full(len(points), 5.0)
+    ...     Y, S, colors[name] = with_balls(X, T, None, np.c_[points, hues, radii].tolist())
     ...     shown[name] = s4a.geometry.mesh.as_dataset(Y, S)
     >>> s4a.show.charts.surfaces(shown, colors)
-    <Parts ...>
+    <TiledFigure ...>
     """
-    mesh, each = plan(study, source, targets, options)
+    mesh, routes_to_targets = plan(study, source, targets, options)
     landmarks = as_landmarks(landmarks)
     marked = locate(landmarks, mesh, farthest=farthest)
     if "landmark_curve" in landmarks:
         marked = trace_curves(marked, mesh)
     named = marked[[name for name in NAMED if name in marked]]
-    carried = {}
-    for name, target, routes in each:
-        carried[name] = _transfer_landmarks(marked, target, routes).merge(named)
-    return xr.DataTree.from_dict(carried)
+    transferred = {}
+    for name, target, routes in routes_to_targets:
+        transferred[name] = _transfer_landmarks(marked, target, routes).merge(named)
+    return xr.DataTree.from_dict(transferred)
 
 
 def _transfer_landmarks(marked, target, routes):
-    """Landmarks at the mean of where the routes lead, weighted by confidence, on the surface."""
+    """Mean of the landmarks of all routes, weighted by confidence, on the surface."""
     X, T = as_arrays(target)
-    start = marked["landmark_triangle"].values, marked["landmark_barycentric"].values
-    ends = [transfer_along(route, *start) for route in routes]
-    confidence = np.stack([own for *_, own in ends])  # (routes, p)
-    triangle, weights, _ = ends[0]
-    spread = {}
-    if len(ends) > 1:
-        points = np.stack([interpolate(X, T, *place) for *place, _ in ends])  # (routes, p, 3)
+    points = marked["landmark_triangle"].values, marked["landmark_barycentric"].values
+    results = [transfer_along(route, *points) for route in routes]
+    confidence = np.stack([result[2] for result in results])  # (routes, p)
+    triangle, weights, _ = results[0]
+    disagreement = {}
+    if len(results) > 1:
+        positions = np.stack([interpolate(X, T, t, w) for t, w, _ in results])  # (routes, p, 3)
         share = confidence + 1e-9
-        mean = np.einsum("rp,rpx->px", share, points) / share.sum(0)[:, None]
+        mean = np.einsum("rp,rpx->px", share, positions) / share.sum(0)[:, None]
         triangle, weights = closest_point(mean, X, T)
-        spread["landmark_disagreement"] = np.linalg.norm(points - mean, axis=2).max(0)
+        disagreement["landmark_disagreement"] = np.linalg.norm(positions - mean, axis=2).max(0)
     return dataset(
         landmark_position=interpolate(X, T, triangle, weights),
         landmark_triangle=triangle.astype(np.int32),
         landmark_barycentric=weights,
         landmark_confidence=confidence.mean(0),
-        **spread,
+        **disagreement,
     )

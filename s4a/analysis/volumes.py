@@ -1,6 +1,6 @@
-"""Labels of the template carried to every shape and written as volumes, in the grid of its scan.
+"""Labels transferred from the template to every shape, as volumes in the grid of its scan (6.2).
 
-A voxel whose centre is within a shape has the label of the vertex that is nearest to it (6.2).
+A voxel whose centre is inside a shape gets the label of its nearest vertex.
 """
 
 import logging
@@ -32,19 +32,19 @@ def write_label_volumes(
     label: np.ndarray | None = None,
     grid: Path | str | None = None,
 ) -> list[Path]:
-    """Write labels of the template, carried to every shape, as NIfTI label volumes.
+    """Transfer labels of the template to every shape and write them as NIfTI volumes.
 
     Parameters
     ----------
     study : DataTree
     folder : path
-        Gets ``<shape>.nii.gz``: whole numbers, 0 outside of the shape, with the affine map of the
+        Folder for ``<shape>.nii.gz``: integers, 0 outside the shape, with the affine map of the
         grid, in millimetres, RAS.
     label : int array_like (vertex,), optional
-        Of the template's vertices, not 0; by default those of its file.
+        Labels of the template's vertices, not 0; by default those of its file.
     grid : path, optional
-        NIfTI or MGH volume whose voxels are taken for every shape; by default those of the volume
-        that the shape was made of, of which the voxels that were marked are labelled.
+        NIfTI or MGH volume that defines the voxel grid of every shape; by default the label volume
+        from which each shape was extracted, with its labelled voxels.
 
     Returns
     -------
@@ -53,12 +53,16 @@ def write_label_volumes(
     Raises
     ------
     ValueError
-        When there are no labels or they are no whole numbers, a shape was made of no volume and
-        there is no grid, or no voxel of the grid is within a shape.
+        If labels are missing or not integers, a shape was not extracted from a volume and `grid` is
+        not given, or no voxel is inside a shape.
+
+    See Also
+    --------
+    s4a.transfer_labels : Labels at vertices.
 
     Examples
     --------
-    With the ``study`` of six small brains, in the voxels of a scan of 4 mm:
+    In a study of six small brains, in the voxels of a scan of 4 mm:
 
     >>> import tempfile
     >>> from pathlib import Path
@@ -80,54 +84,54 @@ def write_label_volumes(
         mesh = study["original"][template].to_dataset()
         if "label" not in mesh:
             raise ValueError(
-                f"labels of the template {template!r} needed, its file has none: give label= "
+                f"labels of the template {template!r} are needed; its file has none: give label= "
                 "(--labels FILE)"
             )
         label = mesh["label"].values
     label = np.asarray(label)
     if label.dtype.kind not in "iu" or abs(label).max(initial=0) >= 2**31:
         raise ValueError(
-            f"a volume of labels needs whole numbers under {2**31}, found {label.dtype}; number "
-            "them first"
+            f"a label volume needs integers under {2**31}; found {label.dtype}: number the labels "
+            "first"
         )
-    grids = {name: _grid_of(study, name, grid) for name in names}  # before anything is written
-    carried = transfer_labels(study, label, targets=names)
+    grids = {name: _grid_of(study, name, grid) for name in names}  # before any file is written
+    transferred = transfer_labels(study, label, targets=names)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for name in names:
         mesh = study["original"][name].to_dataset()
-        volume = _volume(mesh, name, carried[name]["label"].values, *grids[name])
+        volume = _volume(mesh, name, transferred[name]["label"].values, *grids[name])
         paths.append(folder / f"{name}.nii.gz")
         _save(paths[-1], *volume)
     return paths
 
 
 def _grid_of(study, name, grid):
-    """The volume whose voxels are taken, and the label that made the shape, if it did."""
+    """Volume that defines the grid, and the label from which the shape was extracted, if any."""
     attrs = study["original"][name].attrs
     if grid is not None:
         return grid, None
     if attrs.get("format") not in VOLUMES:
         raise ValueError(
-            f"{name} was made of no volume, but of {attrs.get('format') or 'arrays'}: give the "
-            "scan whose grid is to be filled, grid= (--grid FILE)"
+            f"{name} was read from {attrs.get('format') or 'arrays'}, not from a volume: give a "
+            "scan that defines the grid, grid= (--grid FILE)"
         )
     if not Path(attrs.get("path", "")).is_file():
         raise ValueError(
-            f"{name} was made of {attrs.get('path')}, which is no longer there: give grid= "
+            f"{name} was read from {attrs.get('path')}, which no longer exists: give grid= "
             "(--grid FILE)"
         )
     return attrs["path"], attrs["label"]
 
 
-def _volume(mesh, name, label, grid, made_of):
-    """Labels at the voxels of a grid ``(x, y, z)``, and its affine map."""
+def _volume(mesh, name, label, grid, source_label):
+    """Labels at the voxels of a grid ``(x, y, z)``, and the affine map."""
     Y, S = as_arrays(mesh)
     Y, S = (in_file(mesh, Y), S[:, ::-1]) if mesh.attrs.get("reflected") else (Y, S)
     Y = _in_millimetres(mesh, name, Y)
-    if made_of is not None:
-        inside, affine = voxels_marked(grid, made_of)
+    if source_label is not None:
+        inside, affine = voxels_marked(grid, source_label)
         voxel = np.argwhere(inside)
         centre = voxel @ affine[:3, :3].T + affine[:3, 3]
         shape = inside.shape
@@ -136,8 +140,9 @@ def _volume(mesh, name, label, grid, made_of):
         voxel, centre = _voxels_within(Y, S, shape, affine)
         if not len(voxel):
             raise ValueError(
-                f"no voxel of {grid} is within {name}: the surface lies from "
-                f"{_place(Y.min(0))} to {_place(Y.max(0))} mm (RAS); is it the scan of this shape?"
+                f"no voxel of {grid} is inside {name}, whose surface extends from "
+                f"{_as_text(Y.min(0))} to {_as_text(Y.max(0))} mm (RAS): give the scan of this "
+                "shape"
             )
     values = np.zeros(shape, np.int32)
     values[tuple(voxel.T)] = label[cKDTree(Y).query(centre)[1]]
@@ -149,8 +154,7 @@ def _in_millimetres(mesh, name, Y):
     unit, system = unit_of(mesh["position"]), mesh.attrs.get("coordinate_system", "")
     if unit not in MILLIMETRES or not system:
         log.warning(
-            "%s does not say its unit or whether it is RAS or LPS (%s, %s): millimetres and RAS "
-            "are taken",
+            "unit or coordinate system of %s are unknown (%s, %s): millimetres and RAS are assumed",
             name,
             unit,
             system or "unknown",
@@ -160,7 +164,7 @@ def _in_millimetres(mesh, name, Y):
 
 
 def _voxels_within(Y, S, shape, affine):
-    """Indices ``(v, 3)`` of the voxels whose centres are within a surface, and these centres."""
+    """Indices ``(v, 3)`` and centres of the voxels inside a surface."""
     inverse = np.linalg.inv(affine)
     corners = Y @ inverse[:3, :3].T + inverse[:3, 3]
     low = np.maximum(np.ceil(corners.min(0)).astype(int), 0)
@@ -175,7 +179,7 @@ def _voxels_within(Y, S, shape, affine):
     return voxel[inside], centre[inside]
 
 
-def _place(point):
+def _as_text(point):
     return "(" + ", ".join(f"{x:.1f}" for x in point.tolist()) + ")"
 
 

@@ -89,12 +89,8 @@ def dependencies() -> Iterator[Finding]:
     wrong = []
     for name, floor in needed():
         here = version_of(name)
-        if not here:
-            wrong.append(
-                Finding(name, "missing", "not installed", f"pip install '{name}>={floor}'")
-            )
-        elif numbers(here) < numbers(floor):
-            text = f"{here}, and {floor} or newer is needed"
+        if not here or numbers(here) < numbers(floor):
+            text = f"{here}, and {floor} or newer is needed" if here else "not installed"
             wrong.append(Finding(name, "missing", text, f"pip install --upgrade '{name}>={floor}'"))
     modules = [MODULES.get(name, name.replace("-", "_")) for name, _ in needed()]
     result = run(IMPORTS, *modules)
@@ -104,9 +100,8 @@ def dependencies() -> Iterator[Finding]:
             doing = f"pip install --force-reinstall {NAMES.get(name, name)}"
             wrong.append(Finding(name, "missing", f"does not import: {error}", doing))
     if result.returncode:
-        wrong.append(
-            Finding("packages", "missing", f"end the process: {end_of(result)}", "a new venv")
-        )
+        text = f"end the process: {end_of(result)}"
+        wrong.append(Finding("packages", "missing", text, "a new venv"))
     text = f"S4A {version('s4a')} and the {len(modules)} packages that it needs"
     yield from wrong or [Finding("packages", "ok", text)]
 
@@ -266,6 +261,5 @@ def lines(findings: list[Finding]) -> list[str]:
     found = []
     for one in findings:
         found.append(f"{one.state:<9}{one.what:<18}{one.found}")
-        if one.do:
-            found.append(f"{'':27}-> {one.do}")
+        found += [f"{'':27}-> {one.do}"] * bool(one.do)
     return found

@@ -50,7 +50,7 @@ LONGEST = 24  # letters of a name
 LARGEST = 3  # stages whose time a summary says
 TRANSFERRED = (
     *("target", "cycle error", "|distortion|", "confidence", "share of votes"),
-    *("labels of dropped vertices", "landmarks", "spread"),
+    *("labels of dropped vertices", "landmarks", "disagreement"),
 )
 
 
@@ -394,11 +394,10 @@ def registration_cells(registration: "xr.Dataset") -> list[str]:
 
 
 def landmark_cells(landmarks: "xr.Dataset") -> list[str]:
-    """Mean confidence and spread of landmarks that were carried over."""
-    cells = [f"{landmarks['landmark_confidence'].mean().item():.2f}", "-"]
-    if "landmark_disagreement" in landmarks:
-        cells[1] = f"{landmarks['landmark_disagreement'].mean().item():.3g}"
-    return cells
+    """Return mean confidence and disagreement of transferred landmarks."""
+    cells = {"landmark_confidence": ".2f", "landmark_disagreement": ".3g"}
+    known = {name: landmarks[name].mean().item() for name in cells if name in landmarks}
+    return [f"{known[name]:{form}}" if name in known else "-" for name, form in cells.items()]
 
 
 def true_line(modes: "xr.Dataset", truth: "xr.Dataset") -> str:

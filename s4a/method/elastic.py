@@ -189,7 +189,7 @@ def normal_equations(
 
     With W_i = slide I + (1 - slide) m_i m_i^T the term is sum_i a_i (z_i - y_i)^T W_i (z_i - y_i).
     The unknowns are the stacked columns of w.  The matrix product is in single precision, which
-    takes half the time and rounds to 1e-5 of what `slide` adds.
+    takes half the time, with an error of 1e-5 of what `slide` adds.
 
     Parameters
     ----------

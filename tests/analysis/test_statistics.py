@@ -105,7 +105,7 @@ def test_values_with_names_are_taken_by_name_in_whatever_order_they_come(family)
     with pytest.raises(ValueError, match="age needs a value for every shape; it lacks shape_00"):
         values_of(study, mixed.rename({"shape_00": "shape_0"}), "age")
     twice = pandas.concat([mixed, mixed[:1]])
-    with pytest.raises(ValueError, match="one value for every shape; it has more of shape_0"):
+    with pytest.raises(ValueError, match="one value for every shape; it has several for shape_0"):
         values_of(study, twice, "age")
 
 
@@ -349,7 +349,7 @@ def test_small_groups_are_refused_or_warned_of_and_the_smallest_p_is_told(caplog
         statistics.group_test(study, {f"shape_{i:02d}": "a" for i in range(7) if i != 3})
     with pytest.raises(ValueError, match="needs one value for each of 7 shapes"):
         statistics.regression(study, np.arange(6))
-    with pytest.raises(ValueError, match="what is tested is a combination of the covariates"):
+    with pytest.raises(ValueError, match="the tested variable is a combination of the covariates"):
         statistics.regression(study, np.arange(7), covariates=2 * np.arange(7) + 1)
     with pytest.raises(ValueError, match="'age' needs a column of that name in /subjects"):
         statistics.regression(study, "age")
@@ -367,11 +367,11 @@ def twelve():
 @pytest.mark.parametrize(
     "variable, words",
     [
-        (np.full(12, 0.1), "what is tested is constant"),
-        (1e9 + 1e-7 * np.arange(12), "what is tested is constant"),
+        (np.full(12, 0.1), "the tested variable is constant"),
+        (1e9 + 1e-7 * np.arange(12), "the tested variable is constant"),
         (1e-300 * np.arange(1, 13), "of a size between 1e-30 and 1e30, found 1.2e-299"),
         ([np.inf] + [1.0] * 11, "variable needs finite numbers; found infinite ones for shape_00"),
-        ([np.nan] * 12, "at least 4 shapes with all values, found 0 of 12"),
+        ([np.nan] * 12, "at least 4 shapes with all values; found 0 of 12"),
         (np.array(["2020-01-01"] * 12, "M8[D]"), "found dates; a date can be given as a number"),
         (np.arange(12) * 1j, "found complex numbers"),
         (np.zeros((12, 2)), "one number for each shape"),
@@ -399,8 +399,8 @@ def test_neither_unit_nor_origin_of_a_variable_changes_its_test(twelve):
     [
         (["31,5", *(f"4{i},1" for i in range(11))], "a decimal point and without unit, and NA"),
         ([f"s{i}" for i in range(12)], "it names shapes, not groups of them"),
-        ([f"2020-01-0{1 + i % 3}" for i in range(12)], "holds dates, such as 2020-01-01"),
-        ([0, 1] * 6, "what is tested is a combination of the covariates"),
+        ([f"2020-01-0{1 + i % 3}" for i in range(12)], "has dates, such as 2020-01-01"),
+        ([0, 1] * 6, "the tested variable is a combination of the covariates"),
         (np.random.default_rng(0).normal(size=(12, 11)), "11 of the covariates.*14 shapes needed"),
     ],
 )
@@ -436,7 +436,7 @@ def test_a_covariate_that_numbers_the_shapes_is_told(twelve, caplog):
         "site id": [1, 2, 3] * 4,
     }
     statistics.group_test(study, group, covariates=given, n_permutations=9)
-    words = " has another whole number"
+    words = " has a different integer"
     told = [line.partition(words)[0] for line in caplog.messages if words in line]
     assert told == ["covariate 'order'", "covariate 'Subject_ID'"]
     assert "for each shape, 1000 to 1077: leave it out if it numbers the shapes" in caplog.text
@@ -512,9 +512,9 @@ def test_groups_of_unequal_scatter_are_told_and_signs_hold_the_level(caplog):
     noise = smooth_noise(np.random.default_rng(1), u, 20)
     study = study_of(u, T, noise * (1 + 2 * x)[:, None, None])
     statistics.group_test(study, x, n_permutations=19, variances="unequal")
-    assert "scatter differently" not in caplog.text
+    assert "variance differs" not in caplog.text
     statistics.group_test(study, x, n_permutations=19)
-    assert "scatter differently (0.0: " in caplog.text
+    assert "variance differs (0.0: " in caplog.text
     with pytest.raises(ValueError, match="variances must be 'equal' or 'unequal'"):
         statistics.group_test(study, x, variances="welch")
 
@@ -585,7 +585,7 @@ def test_a_regression_is_a_mode_that_page_panel_and_animation_show(simulated, tm
     panel.scores = [1.5]
     assert panel.vertices() == pytest.approx(later, abs=1e-5)
     panel.close()
-    assert "component 1" in write_page(moving, tmp_path / "page.html").read_text()
+    assert "mode 1" in write_page(moving, tmp_path / "page.html").read_text()
     path = write_film(moving, tmp_path / "age.gif", mode=None, n_frames=4, width=100)
     with Image.open(path) as picture:
         assert (picture.n_frames, picture.width) == (4, 100)

@@ -72,7 +72,7 @@ def test_a_package_that_is_missing_old_or_broken_is_named_with_what_to_type(
     needed = [("nosuchthing", "1.0"), ("numpy", "99.1"), ("libigl", "1.0"), ("scipy", "1.0")]
     monkeypatch.setattr(doctor, "needed", lambda extra="": needed)
     found = list(doctor.dependencies())
-    assert of(found, "nosuchthing").do == "pip install 'nosuchthing>=1.0'"
+    assert of(found, "nosuchthing").do == "pip install --upgrade 'nosuchthing>=1.0'"
     assert of(found, "numpy").do == "pip install --upgrade 'numpy>=99.1'"
     assert "wrong ELF class" in of(found, "igl").found
     assert of(found, "igl").do == "pip install --force-reinstall libigl"

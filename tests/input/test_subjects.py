@@ -207,7 +207,7 @@ def test_shapes_without_a_value_are_left_out_of_the_test_and_named(folder, caplo
         {"registration": registration, "subjects": table.where(table["age"] < 50)}
     )
     result = statistics.regression(holes, "age", n_permutations=9)
-    assert "no value for 1 of 6 shapes, which are left out of the test: brain_06" in caplog.text
+    assert "no value for 1 of 6 shapes, which are excluded from the test: brain_06" in caplog.text
     five = registration.isel(shape=slice(5))
     alone = statistics.regression(
         xr.DataTree.from_dict({"registration": five}), table["age"].values[:5], n_permutations=9

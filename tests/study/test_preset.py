@@ -249,7 +249,7 @@ def test_a_transfer_refuses_by_name_what_its_preset_fixes(what, study, paper, me
 @pytest.mark.parametrize("what", ["labels", "scalars", "landmarks"])
 def test_options_are_refused_where_nothing_is_matched(what, study, meshes):
     external = meshes["brain_04"]
-    message = "options preset need a source that is none of the shapes.*the shape 'brain_04'"
+    message = "options preset need an external source.*the shape 'brain_04'"
     with pytest.raises(ValueError, match=message):
         transfers(external)[what](study, source="brain_04", preset="paper")
     with pytest.raises(TypeError, match="unexpected option n_pairs of a pair; there are preset"):
