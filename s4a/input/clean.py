@@ -582,7 +582,7 @@ def _pairs_around_edges(P, F, group, edge_of, count):
     corner = F.T.ravel()
     towards = P[corner[(g + 2 * m) % (3 * m)]] - P[corner[h]]  # to the third corner of the mate
     convex = np.einsum("ij,ij->i", normal[h % m], towards) < 0
-    return pair, np.round(1 - cos, 6) + 4 * twisted - 1e-7 * convex
+    return pairs, np.round(1 - cos, 6) + 4 * twisted - 1e-7 * convex
 
 
 def _orient(P, F, group, mate, counts):
