@@ -139,7 +139,7 @@ def test_a_far_outlier_does_not_weld_the_shape():
 
 
 def cracked(distance):
-    """A sphere whose triangles have one or the other of two vertices that lie a gap apart."""
+    """A sphere whose triangles have one or the other of two vertices at a small distance."""
     X, T = sphere()
     with_it = np.flatnonzero((T == 0).any(axis=1))[::2]
     T[with_it] = np.where(T[with_it] == 0, len(X), T[with_it])

@@ -98,10 +98,10 @@ def test_every_fault_has_its_outcome(name, in_python, checked, ran):
             assert name not in report["shape"].values
         else:
             row = report.sel(shape=name)
-            # ten functions on 100 vertices register some shapes wrongly, which a run says
+            # ten functions on 100 vertices register some shapes wrongly, which a run flags
             wrong = report is in_run and "registration" in row["flag_kinds"].item()
             assert row["status"].item() == ("flagged" if wrong else one.status)
-        if not (silent and report is in_run):  # a run has other things to say of them
+        if not (silent and report is in_run):  # a run has other warnings
             assert re.search(one.said, message(report, one))
     used = one.status in ("ok", "repaired", "flagged")
     assert (name in ran[2]["registration"]["shape"].values) == used

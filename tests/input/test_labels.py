@@ -188,7 +188,7 @@ def test_a_volume_without_a_label_says_how_to_read_it(tmp_path):
 
 @pytest.fixture(scope="module")
 def volumes(tmp_path_factory):
-    """Four ellipsoids of label 17 in volumes, a mesh and a text beside them."""
+    """Four ellipsoids of label 17 in volumes, with a mesh and a text file in the folder."""
     folder = tmp_path_factory.mktemp("volumes")
     for i in range(5):
         axes = np.array([10, 7 + i / 2, 6 - i / 3])

@@ -51,7 +51,7 @@ def test_pickles_are_never_executed(tmp_path):
 
 
 def xml_files():
-    """A whole file of every format in XML, the name of its root, and what reads it."""
+    """A valid file of every format in XML, the name of its root, and its reader."""
     table = fuzz.seeds()
     readers = {"mesh": read_mesh, "labels": read_labels, "landmarks": read_landmarks}
     for name, root in (

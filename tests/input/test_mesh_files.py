@@ -150,7 +150,7 @@ MESHES = [name for name, (_, kind, _) in SEEDS.items() if kind == "mesh" and nam
 
 
 def wholes(name):
-    """The whole files of a format from which damaged ones are made."""
+    """Valid files of a format, from which damaged ones are made."""
     return [finish(content) for content, finish in SEEDS[name][2] if finish is fuzz.whole]
 
 

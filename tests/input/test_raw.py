@@ -22,7 +22,7 @@ if sys.platform == "win32":
 
 FORGED = "f\ngood_0  excluded\x1b[2J\u202eylp.ply"  # what its name would write
 LONG = "n" * 249
-IRREGULAR = {  # file -> what is said of it
+IRREGULAR = {  # file -> message
     "pipe.ply": "found a named pipe",
     "pipe_labels.gii": "found a named pipe",
     "pipe_arrays.npz": "found a named pipe",
@@ -108,7 +108,7 @@ def test_what_is_no_regular_file_is_refused_at_once_by_every_reader(folder):
 def test_a_file_that_may_not_be_read_is_named(tmp_path):
     write_mesh(tmp_path / "secret.ply", *shape())
     (tmp_path / "secret.ply").chmod(0)
-    root = os.geteuid() == 0  # whom no mode keeps from reading
+    root = os.geteuid() == 0  # can read in spite of any mode
     if root:
         os.seteuid(65534)
     try:

@@ -99,7 +99,7 @@ def test_a_worker_killed_in_the_middle_costs_only_its_task(brain_files, study_of
     again = [path for path, time in done.items() if path.stat().st_mtime_ns != time]
     assert (
         len(again) <= 1
-    )  # the task of the dead worker may have been written, but not yet told to the scheduler
+    )  # the task of the dead worker may have been written, but not yet reported to the scheduler
 
 
 @pytest.mark.parametrize("address", ["nowhere", "local:", "local:0", "local:two"])

@@ -11,7 +11,7 @@ from s4a.method.shape import Shape, common_fields
 
 
 def egg(twist=0.0, n=1500):
-    """An ellipsoid that is twisted within its own surface, and a field that goes along."""
+    """An ellipsoid that is twisted within its own surface, and a field that is transferred with it."""
     axes = np.array([1.0, 1.3, 2.0])
     X, T = as_arrays(s4a.synthetic.ellipsoid(n, axes))
     u = X / axes
@@ -53,7 +53,7 @@ def test_a_field_is_standard_at_both_resolutions_and_unknown_values_count_as_the
     mesh = s4a.with_features(mesh, {"depth": values, "flat": np.ones(len(f))})
     shape = Shape(mesh, low_resolution(mesh, n_coarse=300, k=10))
     for basis in (shape.full, shape.low):
-        assert list(basis.fields) == ["depth"]  # what is the same everywhere says nothing
+        assert list(basis.fields) == ["depth"]  # constant fields are ignored
         one = basis.fields["depth"]
         assert abs(basis.area @ one) < 0.1
         assert 0.6 < basis.area @ one**2 < 1.05
@@ -78,7 +78,7 @@ def test_a_field_that_does_not_fit_is_refused(given, text):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Four brains as files, three of them with a file of a field beside."""
+    """Four brains as files, three of them with a file of a field."""
     folder = tmp_path_factory.mktemp("files")
     tree = s4a.synthetic.brains(4, 1500, seed=1)
     for path in s4a.synthetic.write(tree, folder)[:3]:

@@ -226,7 +226,7 @@ def test_a_run_killed_in_every_stage_ends_with_the_same_study(files, whole, tmp_
         "network.nc",
         "registration.nc",
         "pca.nc",
-    }  # of two files or none a task: made again, and the same
+    }  # tasks of two files or none: computed again, with the same result
     for file in set(result) - shared:
         assert messages.count(f"written {file}") == 1, file
     assert not list((tmp_path / "study").rglob(".*.tmp"))
@@ -234,7 +234,7 @@ def test_a_run_killed_in_every_stage_ends_with_the_same_study(files, whole, tmp_
 
 
 def contents(folder):
-    """Every file of a study, without what the clock says."""
+    """Every file of a study, without times."""
     files = {
         path.relative_to(folder).as_posix(): netcdf.read(path) for path in folder.rglob("[!.]*.nc")
     }

@@ -1,4 +1,4 @@
-"""A few of the kills of ``benchmarks/kills.py``, so that it is known to run."""
+"""A few of the kills of ``benchmarks/kills.py``, as a test that it runs."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Landmarks of the user: what they pull, what they decide, and what is said of wrong ones."""
+"""Landmarks of the user: their effect on the registration, and errors for wrong ones."""
 
 import logging
 import subprocess
@@ -104,7 +104,7 @@ def test_three_landmarks_say_how_a_shape_lies_that_its_form_does_not_tell(n):
         for P in (there, there @ turn.T)
     ]
     R, _ = transform_onto(*lows)
-    # an ellipsoid lies on itself after each half turn; as it lies, by its form alone
+    # an ellipsoid coincides with itself after each half turn
     assert np.allclose(R, turn if n == 3 else np.eye(3), atol=0.15)
 
 

@@ -1,4 +1,4 @@
-"""A pair registered on its own: what it takes of the machine."""
+"""Pairwise registration: use of threads."""
 
 from threadpoolctl import threadpool_info, threadpool_limits
 

@@ -316,7 +316,7 @@ def test_identical_shapes_give_finite_results_and_modes_only_with_a_shape_that_d
     tree = analyse({f"s{i}": mesh[one] for i, one in enumerate(given)}, **OPTIONS)
     for node in tree.subtree:
         for name, data in node.to_dataset(inherit=False).data_vars.items():
-            # two shapes make no 3-cycle; of three, the second of two equal ones stands apart
+            # two shapes make no 3-cycle; of three, the second of two equal ones is excluded
             if data.dtype.kind == "f" and (
                 tree["network"].sizes["pair"] > 2 or "cycle" not in name
             ):

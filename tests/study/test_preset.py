@@ -166,7 +166,7 @@ def test_an_external_mesh_is_matched_by_the_options_of_the_study(paper, meshes, 
         result = s4a.transfer_labels(
             study, external["label"].values, source=external, targets=["brain_01"]
         )
-        assert calls == [Options.from_report(study)]  # one way
+        assert calls == [Options.from_report(study)]  # one direction
     assert calls[0].preset == "paper"
     assert calls[0].n_coarse == OPTIONS["n_coarse"]
     assert result["brain_01"].sizes["vertex"] == 1500

@@ -114,7 +114,7 @@ def test_a_new_shape_of_the_other_side_is_mirrored_on_request(newcomer, folder, 
         stayed = s4a.insert(study, {"s9": right}, reflect="auto", n_jobs=1)
     assert stayed["report"]["reflected"].values.tolist() == [0]
     assert stayed["pca"]["score"].equals(known["pca"]["score"])
-    write_registered(result, tmp_path, frame="shape")  # where its file lies
+    write_registered(result, tmp_path, frame="shape")  # in the frame of its file
     points, _, _ = s4a.read_mesh(tmp_path / "s9.ply")
     assert np.linalg.norm(points.mean(0) - left[0].mean(0)) < 0.05 * np.ptp(left[0], axis=0).max()
 

@@ -293,7 +293,7 @@ def test_a_study_that_was_copied_without_its_lock_is_still_a_study(tmp_path):
     store.write(synthetic.sphere(50), tmp_path / "original" / "a.nc", "key")
     mine.write_bytes(b"mine")
     with store.lock(tmp_path):
-        assert mine.exists()  # only temporary files of our own go
+        assert mine.exists()  # only temporary files of s4a are removed
 
 
 def test_a_lock_that_is_a_symbolic_link_is_not_followed(tmp_path):
