@@ -11,7 +11,7 @@ from s4a.method.shape import Shape, common_fields
 
 
 def egg(twist=0.0, n=1500):
-    """An ellipsoid that is twisted within its own surface, and a field that is transferred with it."""
+    """An ellipsoid that is twisted within its surface, and a field that follows the twist."""
     axes = np.array([1.0, 1.3, 2.0])
     X, T = as_arrays(s4a.synthetic.ellipsoid(n, axes))
     u = X / axes
