@@ -159,7 +159,7 @@ def is_mirrored(
     ----------
     name : str
     comparison : Dataset
-        Of :func:`s4a.input.plausibility.compare`.
+        See :func:`s4a.input.plausibility.compare`.
     others : dict of str to Dataset
         Comparisons of the other shapes.
     """

@@ -116,7 +116,7 @@ def remove_remains(token: str) -> None:
     Parameters
     ----------
     token : str
-        Of :class:`s4a.study.store.Claim`, read from a lock that no process holds.
+        Token of :class:`s4a.study.store.Claim`, read from a lock that no process holds.
     """
     owner = re.match(r"\d{1,9}\b", token)
     if not owner or not psutil or psutil.pid_exists(int(owner[0])):

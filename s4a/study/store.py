@@ -101,7 +101,7 @@ def write(
     data : Dataset or DataTree
     path : Path or str
     key : str
-        Of :func:`task_key`.
+        See :func:`task_key`.
     made_from : iterable of str
         Keys of the files that it was computed from; :func:`s4a.open_study` skips a file if one of
         them is missing, as after an incomplete run with other options.

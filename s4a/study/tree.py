@@ -51,7 +51,7 @@ def stack_registration(
     Parameters
     ----------
     template : Dataset
-        Of :func:`template_mesh`.
+        See :func:`template_mesh`.
     files : dict of str to Dataset
         Registrations, see :func:`s4a.method.register.registration`.
     names : list of str
