@@ -110,7 +110,7 @@ def test_hdf5_has_the_dims_that_h5netcdf_gives_and_a_checksum_of_every_variable_
     ("data", "error", "needed"),
     [
         (xr.Dataset({"a/b": 1}), ValueError, "without slash"),
-        (xr.Dataset({"a": ("b/c", [1])}), ValueError, "without slash, .*b/c"),
+        (xr.Dataset({"a": ("b/c", [1])}), ValueError, "without slash .*b/c"),
         (xr.Dataset({"row": (("row", "column"), np.eye(2))}), ValueError, "found row"),
         (
             xr.Dataset({"a": ("x", np.array(["2026"], "M8[ns]"))}),
