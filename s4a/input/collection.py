@@ -195,8 +195,8 @@ def read_shapes(
 def read_labels(paths: Paths, *, label: Label = "all", **options: Any) -> xr.DataTree:
     """Read label volumes as a collection of surfaces, one structure of each volume.
 
-    Surfaces are extracted by marching cubes, smoothed without shrinking (Taubin, 1995) and
-    cleaned.  World coordinates are in millimetres, RAS.
+    Surfaces are extracted by marching cubes, smoothed without shrinking and cleaned.  World
+    coordinates are in millimetres, RAS.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def read_labels(paths: Paths, *, label: Label = "all", **options: Any) -> xr.Dat
 
     References
     ----------
-    Taubin, G. (1995). A signal processing approach to fair surface design. SIGGRAPH.
+    G. Taubin (1995), A signal processing approach to fair surface design, SIGGRAPH.
 
     Examples
     --------

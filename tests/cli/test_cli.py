@@ -60,7 +60,7 @@ def test_run_writes_a_line_for_each_stage_where_there_is_no_terminal(ran):
     _, result = ran
     lines = [line for line in result.stderr.splitlines() if line.startswith("INFO: ")]
     assert [line.split(": ")[1] for line in lines] == list(STAGES)
-    assert re.fullmatch(r"INFO: registration: 4 of 4 were to do, [\d.]+ s, \d+ MiB", lines[-2])
+    assert re.fullmatch(r"INFO: registration: 4 of 4 tasks computed, [\d.]+ s, \d+ MiB", lines[-2])
     assert "it/s" not in result.stderr
 
 
