@@ -207,7 +207,7 @@ def covariation(
         field=field,
         permutations=n_permutations,
         smallest_p=max(1 / (n_permutations + 1), 1 / math.factorial(n)),
-        **of_field.said,
+        **of_field.attributes,
     )
 
 

@@ -227,7 +227,7 @@ def test_samples_have_the_drawn_scores(simulated):
     )
     moved = np.tensordot(drawn["score"].values[0], simulated[0]["pca"]["deformation"].values[:3], 1)
     assert drawn["sample_1"]["position"].values == pytest.approx(template + moved, abs=1e-6)
-    with pytest.raises(ValueError, match="a number from 1 to 29, found 30"):
+    with pytest.raises(ValueError, match="a number from 1 to 29; found 30"):
         statistics.sample(simulated[0], 2, n_components=30)
 
 
@@ -353,7 +353,7 @@ def test_small_groups_are_refused_or_warned_of_and_the_smallest_p_is_told(caplog
         statistics.regression(study, np.arange(7), covariates=2 * np.arange(7) + 1)
     with pytest.raises(ValueError, match="'age' needs a column of that name in /subjects"):
         statistics.regression(study, "age")
-    with pytest.raises(ValueError, match="at least 4 shapes, found 3"):
+    with pytest.raises(ValueError, match="at least 4 shapes; found 3"):
         statistics.outliers(study_of(u, T, smooth_noise(rng, u, 3)))
 
 
@@ -369,10 +369,10 @@ def twelve():
     [
         (np.full(12, 0.1), "the tested variable is constant"),
         (1e9 + 1e-7 * np.arange(12), "the tested variable is constant"),
-        (1e-300 * np.arange(1, 13), "of a size between 1e-30 and 1e30, found 1.2e-299"),
+        (1e-300 * np.arange(1, 13), "between 1e-30 and 1e30; found 1.2e-299"),
         ([np.inf] + [1.0] * 11, "variable needs finite numbers; found infinite ones for shape_00"),
         ([np.nan] * 12, "at least 4 shapes with all values; found 0 of 12"),
-        (np.array(["2020-01-01"] * 12, "M8[D]"), "found dates; a date can be given as a number"),
+        (np.array(["2020-01-01"] * 12, "M8[D]"), "found dates: give a date as a number"),
         (np.arange(12) * 1j, "found complex numbers"),
         (np.zeros((12, 2)), "one number for each shape"),
         (["31", "?", *map(str, range(10))], "1 of its 12 cells are none .shape_01: '\\?'"),
@@ -398,10 +398,10 @@ def test_neither_unit_nor_origin_of_a_variable_changes_its_test(twelve):
     "covariate, words",
     [
         (["31,5", *(f"4{i},1" for i in range(11))], "a decimal point and without unit, and NA"),
-        ([f"s{i}" for i in range(12)], "it names shapes, not groups of them"),
+        ([f"s{i}" for i in range(12)], "it names shapes, not groups"),
         ([f"2020-01-0{1 + i % 3}" for i in range(12)], "has dates, such as 2020-01-01"),
         ([0, 1] * 6, "the tested variable is a combination of the covariates"),
-        (np.random.default_rng(0).normal(size=(12, 11)), "11 of the covariates.*14 shapes needed"),
+        (np.random.default_rng(0).normal(size=(12, 11)), "11 covariates.*use 14 shapes"),
     ],
 )
 def test_a_covariate_of_no_use_is_refused_with_what_to_do(covariate, words, twelve):
@@ -478,7 +478,7 @@ def test_a_test_that_can_find_nothing_says_so(twelve, caplog):
 @pytest.mark.parametrize("n", [-1, 0, 10**22])
 def test_a_number_of_permutations_that_makes_no_test_is_refused(n, twelve):
     for test in (statistics.group_test, statistics.group_map, statistics.classify):
-        with pytest.raises(ValueError, match=f"a number from 1 to 10000000, found {n}"):
+        with pytest.raises(ValueError, match=f"a number from 1 to 10000000; found {n}"):
             test(*twelve, n_permutations=n)
 
 
