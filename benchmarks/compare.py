@@ -277,10 +277,7 @@ def embedded(n_vertices=20_000, methods=comparison.METHODS):
     }
     truth = {n: np.asarray(t) for n, t in truth.items()}
     found = s4a.compare(source, dict(others), truth=truth, methods=methods)
-    say(
-        f"\nTable 1 on the sample data: 5 pairs of {n_vertices} vertices, "
-        "landmarks as in 4.1\n"
-    )
+    say(f"\nTable 1 on the sample data: 5 pairs of {n_vertices} vertices, landmarks as in 4.1\n")
     table_1(found)
     figure_3(found)
     if set(comparison.METHODS) <= set(methods):

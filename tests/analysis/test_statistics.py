@@ -184,9 +184,9 @@ def test_specificity_is_the_distance_between_the_fields():
     assert distance.shape == (len(variance), 7) == (4, 7)
     for c in range(4):
         drawn = d.mean(0) + np.einsum("pc,cnx->pnx", score[:, : c + 1], modes[: c + 1])
-        gap = np.sqrt((w * (drawn[:, None] - d) ** 2).sum((2, 3)))
-        assert distance[c] == pytest.approx(gap.min(1))
-        assert (nearest[c] == gap.argmin(1)).all()
+        distances = np.sqrt((w * (drawn[:, None] - d) ** 2).sum((2, 3)))
+        assert distance[c] == pytest.approx(distances.min(1))
+        assert (nearest[c] == distances.argmin(1)).all()
 
 
 def test_only_components_above_chance_explain_more_than_permuted_coefficients():
@@ -322,9 +322,9 @@ def test_the_statistics_are_those_of_the_textbook():
     for v in range(5):
         a, b = d[:6, v], d[6:, v]
         S = (np.cov(a.T, bias=True) * 6 + np.cov(b.T, bias=True) * 8) / 12
-        gap = b.mean(0) - a.mean(0)
+        difference = b.mean(0) - a.mean(0)
         assert 12 * share[v] / (1 - share[v]) == pytest.approx(
-            6 * 8 / 14 * gap @ np.linalg.solve(S, gap), rel=1e-4
+            6 * 8 / 14 * difference @ np.linalg.solve(S, difference), rel=1e-4
         )
     one, _, _ = Model(x, n_permutations=0).vertex_test(d[..., :1])
     t = stats.ttest_ind(d[:6, :, 0], d[6:, :, 0]).statistic
@@ -335,7 +335,7 @@ def test_the_statistics_are_those_of_the_textbook():
     assert 11 / 2 * share / (1 - share) == pytest.approx(F, rel=1e-4)
 
 
-def test_small_groups_are_refused_or_warned_of_and_the_smallest_p_is_told(caplog):
+def test_small_groups_are_refused_or_warned_about_and_the_smallest_p_is_reported(caplog):
     rng = np.random.default_rng(0)
     u, T = as_arrays(synthetic.sphere(200))
     study = study_of(u, T, smooth_noise(rng, u, 7))
@@ -409,7 +409,7 @@ def test_a_covariate_of_no_use_is_refused_with_what_to_do(covariate, words, twel
         statistics.group_test(*twelve, covariates={"it": covariate}, n_permutations=9)
 
 
-def test_what_becomes_of_the_covariates_is_told(twelve, caplog):
+def test_the_handling_of_covariates_is_reported(twelve, caplog):
     study, group = twelve
     size = np.arange(12) ** 2
     given = {"sex": [0, 0, 1, 1] * 3, "site": list("xxyyzz") * 2, "size": size}
@@ -425,7 +425,7 @@ def test_what_becomes_of_the_covariates_is_told(twelve, caplog):
     )
 
 
-def test_a_covariate_that_numbers_the_shapes_is_told(twelve, caplog):
+def test_a_covariate_that_numbers_the_shapes_is_reported(twelve, caplog):
     study, group = twelve
     rng = np.random.default_rng(0)
     given = {
@@ -437,15 +437,15 @@ def test_a_covariate_that_numbers_the_shapes_is_told(twelve, caplog):
     }
     statistics.group_test(study, group, covariates=given, n_permutations=9)
     words = " has a different integer"
-    told = [line.partition(words)[0] for line in caplog.messages if words in line]
-    assert told == ["covariate 'order'", "covariate 'Subject_ID'"]
-    assert "for each shape, 1000 to 1077: leave it out if it numbers the shapes" in caplog.text
+    columns = [line.partition(words)[0] for line in caplog.messages if words in line]
+    assert columns == ["covariate 'order'", "covariate 'Subject_ID'"]
+    assert "for each shape, 1000 to 1077: omit it if it only numbers the shapes" in caplog.text
 
 
-@pytest.mark.parametrize("gap", ["NA", "n/a", "-", "", "nan", None, float("nan")])
-def test_a_missing_text_is_no_group(gap, twelve, caplog):
+@pytest.mark.parametrize("missing", ["NA", "n/a", "-", "", "nan", None, float("nan")])
+def test_a_missing_text_is_no_group(missing, twelve, caplog):
     study, group = twelve
-    found = statistics.group_test(study, [gap, *group[1:11], gap], n_permutations=9)
+    found = statistics.group_test(study, [missing, *group[1:11], missing], n_permutations=9)
     assert found.attrs["groups"] == "a: 5, b: 5"
     assert found.attrs["left_out"] == "shape_00, shape_11"
     assert "no value for 2 of 12 shapes" in caplog.text
@@ -498,7 +498,7 @@ def test_statistics_of_shapes_that_are_equal_or_not_finite_say_so(twelve):
             statistics.group_map(other, twelve[1])
 
 
-def test_groups_of_unequal_scatter_are_told_and_signs_hold_the_level(caplog):
+def test_groups_of_unequal_variance_are_reported_and_sign_flips_hold_the_level(caplog):
     x = np.repeat([0.0, 1.0], [15, 5])
     found = {"equal": [], "unequal": []}
     for seed in range(60):
@@ -522,7 +522,7 @@ def test_groups_of_unequal_scatter_are_told_and_signs_hold_the_level(caplog):
 # outliers and classes
 
 
-def test_a_strange_shape_and_a_far_one_are_outliers_and_the_others_are_not():
+def test_an_unusual_shape_and_an_extreme_one_are_outliers_and_the_others_are_not():
     rng = np.random.default_rng(7)
     u, T = as_arrays(synthetic.sphere(400))
     modes = smooth_noise(rng, u, 2)
