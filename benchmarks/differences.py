@@ -331,7 +331,7 @@ def table(head, rows):
 
 
 def measured(found, rows, columns=("matched", "surface", "seconds")):
-    """Return a table of some rows (name in the results -> name on the page), three columns a set."""
+    """Return a table of rows (name in the results -> name on the page), three columns a set."""
     short = {"matched": "", "surface": "", "carried": "transferred", "seconds": "CPU s"}
     head = [""]
     for which in SETS:
