@@ -9,8 +9,9 @@ BIN := $(VENV)/bin
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
 
-# one process a core, one thread a process
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile --no-loadscope-reorder
+# one process a core and one more, as tests wait for browsers and processes now and then; one thread a process
+WORKERS = $$($(BIN)/python -c "import os; print(os.cpu_count() + 1)")
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 test: check
 	$(PYTEST)
 

@@ -51,7 +51,7 @@ def show(study, out):
         return draw.render(points, triangles, colors=colors, **options | {"size": (50, 40)})
 
     page.render = pictures.render = small
-    code = cli.main(["view", str(study), "--out", str(out / "page.html")])
+    code = cli.main(["view", str(study), "--page", str(out / "page.html")])
     (out / "drawn").write_text(drawn.hexdigest())
     return code
 

@@ -54,12 +54,12 @@ from s4a.geometry.align import farthest_points, rigid_transform
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a_morphometrics import posterior
 from s4a_morphometrics.calibration import (
-    again_of,
-    found_again,
-    gaps_between_ways,
-    held,
+    calibrate,
     image_of,
+    leave_out_parts,
+    path_differences,
     pose_of,
+    regression_slope,
 )
 from s4a_morphometrics.part import cut
 from s4a_morphometrics.partial import model_of
@@ -264,18 +264,18 @@ def rows_of_left_out(found, gaps, wrong):
     """What is measured of the same part of each shape, told by the others; nan without a gap."""
     for name, one in found.items():
         others = {n: other for n, other in found.items() if n != name}
-        again = again_of(others, {n: gap for n, gap in gaps.items() if n != name})
+        again = calibrate(others, {n: gap for n, gap in gaps.items() if n != name})
         at, p, deviation = one.missing
         e = wrong[name]
         variance = (again.factor * deviation[:, None]) ** 2
         every = np.ones(len(at), bool)
         within = [
             shares_within(p + e[at], np.sqrt(variance + more), every)[-1]
-            for more in (again.added, again.ways)
+            for more in (again.added, again.paths)
         ]
         ratios = [
-            held(part.error, of[name][part.at]) if name in of else np.nan
-            for part in (one.missing, one.there)
+            regression_slope(part.error, of[name][part.at]) if name in of else np.nan
+            for part in (one.missing, one.present)
             for of in (wrong, gaps)
         ]
         yield [*within, *ratios]
@@ -288,14 +288,14 @@ def left_out(store, n_planes, seed):
     """
     study, _, true = study_of_brains(store, seed)
     model = model_of(study)
-    gaps, wrong = gaps_between_ways(model), wrong_of(model, true)
+    gaps, wrong = path_differences(model), wrong_of(model, true)
     sys.stdout.write(f"\nbrains of seed {seed}, left out\n\n{heading(HEAD_LEFT_OUT)}")
     tables = {}
     for share in SHARES[1:]:
         rows = [
             row
             for present, density in parts_of(model, share, n_planes)
-            for row in rows_of_left_out(found_again(model, present, density), gaps, wrong)
+            for row in rows_of_left_out(leave_out_parts(model, present, density), gaps, wrong)
         ]
         table = tables[share] = np.array(rows)
         told = [*table[:, :2].mean(0), *np.nanmedian(table[:, 2:], 0)]

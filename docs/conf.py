@@ -1,4 +1,4 @@
-"""The documentation: docstrings, the course, pages in words.
+"""Configuration of the documentation: docstrings, the course, and pages.
 
 No network is needed, to build it or to read it.
 """
@@ -37,7 +37,7 @@ LESSONS = {
     for folder in (NOTEBOOKS, HERE.parent / "morphometrics" / "notebooks")
     for path in sorted(folder.glob("*.ipynb"))
 }
-LARGE = 20_000  # letters of a picture that is packed
+LARGE = 20_000  # characters from which a picture is compressed
 
 project, author = "S4A", "S4A developers"
 copyright = author
@@ -67,9 +67,9 @@ myst_enable_extensions = ["deflist", "dollarmath"]
 myst_heading_anchors = 2
 suppress_warnings = ["mystnb.unknown_mime_type"]
 
-# S4A_DOCS=off leaves the outputs out, for a quick look at words
+# S4A_DOCS=off leaves out the outputs, for a quick build
 nb_execution_mode = os.environ.get("S4A_DOCS", "cache")
-# S4A_LESSONS="00 04" runs these lessons and nothing else, to look at their pages
+# S4A_LESSONS="00 04" runs only these lessons
 SOME = os.environ.get("S4A_LESSONS", "").split()
 if SOME:
     others = {name for name in LESSONS if name[:2] not in SOME}
@@ -79,16 +79,16 @@ nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True
-nb_ipywidgets_js = {}  # of a server elsewhere
-nb_render_error_lexer = "text"  # messages of open exercises
-nb_output_stderr = "remove"  # bars of progress
-nb_mime_priority_overrides = [("html", "text/html", 0)]  # of a panel, its page that needs no kernel
+nb_ipywidgets_js = {}  # no script from another server
+nb_render_error_lexer = "text"  # for the messages of open exercises
+nb_output_stderr = "remove"  # progress bars
+nb_mime_priority_overrides = [("html", "text/html", 0)]  # panels as pages without a kernel
 
 html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "S4A"
 html_static_path = ["_static"]
-html_favicon = "_static/favicon.svg"  # or browsers ask for one that is not there
+html_favicon = "_static/favicon.svg"  # otherwise browsers request a missing file
 html_css_files = ["s4a.css"]
 html_js_files = ["s4a.js"]
 html_show_sphinx = False
@@ -96,17 +96,14 @@ html_copy_source = False
 
 
 def show_panels(app, docname, source):
-    """Before the first cell of the gallery, the cell that shows panels without a kernel."""
+    """Insert the cell that shows panels without a kernel before the first cell of the gallery."""
     if docname == "gallery":
         cell = f"```{{code-cell}}\n:tags: [remove-cell]\n\n{WITHOUT_KERNEL}\n```\n\n"
         source[0] = source[0].replace("```{code-cell}", f"{cell}```{{code-cell}}", 1)
 
 
 def take_course():
-    """The notebooks beside the pages.
-
-    Each with a cell that shows panels and sliders without a kernel.
-    """
+    """Copy the notebooks, each with a cell that shows panels without a kernel."""
     folder = HERE / "course"
     folder.mkdir(exist_ok=True)
     for path in LESSONS.values():
@@ -126,7 +123,7 @@ def take_course():
 
 
 def list_variables():
-    """Every variable of a study, from the table itself."""
+    """Write the table of all variables of a study."""
     rows = [
         f"| `{name}` | {', '.join(dims)} | {unit} | {words.replace('|', chr(92) + '|')} |"
         for name, (dims, unit, words) in TABLE.items()
@@ -138,7 +135,7 @@ def list_variables():
 
 
 def list_commands():
-    """The options of every command, as --help prints them."""
+    """Write the commands and their flags, as --help prints them."""
     os.environ["COLUMNS"] = "100"
     (commands,) = (
         action for action in cli.parser()._actions if hasattr(action, "choices") and action.choices
@@ -153,7 +150,7 @@ def list_commands():
 
 
 def list_options():
-    """The options of an analysis, from where they are declared."""
+    """Write the table of the options of an analysis."""
     lines, group = [], None
     for name, one in DECLARED.items():
         known = one.metadata
@@ -166,7 +163,7 @@ def list_options():
         values = [f"`{value}`" for value in known["choices"]] or kinds
         presets = "".join(f"; {preset}: `{value}`" for preset, value in known["presets"].items())
         text = f"{known['help']}. {known['more']}".strip().replace("|", "\\|").replace("``", "`")
-        text = re.sub(r":\w+:`", "`", f"{text[0].upper()}{text[1:]}")
+        text = re.sub(r":\w+:`", "`", f"{text[0].upper()}{text[1:]}").replace("*", r"\*")
         lines.append(
             f"| `{name}` | `{known['default']}`{presets} | {' or '.join(values)} | {text} |"
         )
@@ -174,28 +171,25 @@ def list_options():
 
 
 def list_tables():
-    """What the commands of speed, and those of all pages, printed when each was run last."""
+    """Write the latest output of the commands of speed, and of those that the pages name."""
     others = [command for command in paper.commands() if command not in paper.SPEED]
     for name, commands in (("performance", paper.SPEED), ("tables", others)):
         files = [paper.kept(command) for command in commands]
         texts = [path.read_text(encoding="utf-8") for path in files if path.exists()]
-        # what a command printed keeps its headings, below that of the command
+        # headings of the output are below that of the command
         texts = [re.sub("^#(?=#* )", "###", text, flags=re.MULTILINE) for text in texts]
         text = "\n".join(text.replace("### `", "## `", 1) for text in texts)
         write(HERE / f"_{name}.md", text)
 
 
 def write(path, text):
-    """Write where it differs, so that nothing is built again without need."""
+    """Write a file if its text has changed, so that Sphinx does not build it again."""
     if not path.exists() or path.read_text(encoding="utf-8") != text:
         path.write_text(text, encoding="utf-8")
 
 
 def bars(app, what, name, obj, options, lines):
-    """Norms and sizes of sets are written with bars.
-
-    Which are marks of substitutions in reStructuredText.
-    """
+    """Escape the bars of norms, which mark substitutions in reStructuredText."""
     for i, line in enumerate(lines):
         if not re.match(r"\s*(>>>|\.\.\.) ", line):
             lines[i] = re.sub(
@@ -204,11 +198,11 @@ def bars(app, what, name, obj, options, lines):
 
 
 def pictures(app, what, name, obj, options, lines):
-    """Below examples that end in a figure stands the figure."""
+    """Insert the figure below examples that end in one."""
     if nb_execution_mode == "off" or SOME or what in ("module", "class"):
         return
     if f"{getattr(obj, '__module__', '')}.{getattr(obj, '__name__', '')}" != name:
-        return  # imported from where it is defined, and documented there
+        return  # imported; it is documented in its own module
     path = examples.draw(name, "\n".join(lines), HERE / "_examples")
     if path is not None:
         words = f"What the last example of {name} shows"
@@ -216,7 +210,7 @@ def pictures(app, what, name, obj, options, lines):
 
 
 def smaller(found):
-    """A picture in a page as WebP: without loss, or with where that is too large."""
+    """Convert a picture of a page to WebP: lossless, or lossy if that is too large."""
     picture, small = Image.open(io.BytesIO(base64.b64decode(found[1]))), io.BytesIO()
     picture.save(small, "webp", lossless=True)
     if small.tell() > LARGE:
@@ -229,7 +223,7 @@ STATE = "application/vnd.jupyter.widget-state+json"
 
 
 def pack_page(app, pagename, templatename, context, doctree):
-    """Smaller pictures of notebooks, and no state of widgets, so that a page is loaded soon."""
+    """Compress the pictures of a page and remove the states of widgets."""
     scripts = context.get("script_files", [])
     scripts[:] = [one for one in scripts if getattr(one, "attributes", {}).get("type") != STATE]
     pattern = rf"data:image/png;base64,([A-Za-z0-9+/]{{{LARGE},}}=*)"
@@ -238,7 +232,7 @@ def pack_page(app, pagename, templatename, context, doctree):
 
 
 def front_door(app, env, node, content):
-    """A reference to a public name, as `s4a.analyse`, goes where its module is documented."""
+    """Resolve a public name, such as `s4a.analyse`, to the page of its module."""
     name = node.get("reftarget", "").removeprefix("s4a.")
     found = getattr(s4a, name, None) if "." not in name else None
     module = getattr(found, "__module__", None)
@@ -250,13 +244,13 @@ def front_door(app, env, node, content):
 
 
 def script(letter):
-    """The script letter of a letter: browsers draw the character, not the style."""
+    """Script character of a letter, because browsers ignore the style."""
     older = {"B": "ℬ", "E": "ℰ", "F": "ℱ", "H": "ℋ", "I": "ℐ", "L": "ℒ", "M": "ℳ", "R": "ℛ"}
     return older.get(letter, chr(0x1D49C + ord(letter) - ord("A")))
 
 
 def formula(translator, node):
-    """MathML, which browsers draw themselves: no script from elsewhere."""
+    """Write a formula as MathML, which browsers draw without a script."""
     display = "inline" if isinstance(node, nodes.math) else "block"
     text = node.astext().replace(r"\lVert", r"\|").replace(r"\rVert", r"\|")
     text = re.sub(
@@ -269,7 +263,7 @@ def formula(translator, node):
 
 
 def setup(app):
-    """Sphinx calls this before it reads the pages."""
+    """Set up the build; Sphinx calls this before it reads the pages."""
     take_course()
     list_variables()
     list_commands()
@@ -278,7 +272,7 @@ def setup(app):
     app.add_html_math_renderer("mathml", (formula, None), (formula, None))
     app.connect("source-read", show_panels)
     app.connect("doctree-resolved", thumbnails.add)
-    app.connect("autodoc-process-docstring", pictures, priority=100)  # before napoleon's words
+    app.connect("autodoc-process-docstring", pictures, priority=100)  # before napoleon
     app.connect("autodoc-process-docstring", bars)
     app.connect("missing-reference", front_door)
-    app.connect("html-page-context", pack_page, priority=900)  # after those of myst_nb
+    app.connect("html-page-context", pack_page, priority=900)  # after myst_nb

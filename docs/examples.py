@@ -1,4 +1,4 @@
-"""The picture of a docstring's examples, where the last of them gives a figure."""
+"""Figures of the examples in docstrings."""
 
 import doctest
 import re
@@ -9,12 +9,12 @@ from s4a.show import charts
 
 
 def figure_of(name, text):
-    """The figure that the last example of a docstring gives; None where it gives none.
+    """Return the figure of the last example of a docstring, or None.
 
     All examples are run in their order; what they print is checked where they are tests.
     """
     examples = doctest.DocTestParser().get_examples(text, name)
-    if not examples or not examples[-1].want.startswith(("<Figure ", "<Parts ")):
+    if not examples or not examples[-1].want.startswith(("<Figure ", "<TiledFigure ")):
         return None
     names = {}
     for example in examples[:-1]:
@@ -26,7 +26,7 @@ def figure_of(name, text):
 
 
 def draw(name, text, folder):
-    """The file with the picture of a docstring below a folder; None where it has none."""
+    """Write the figure of a docstring into a folder; return its path, or None."""
     figure = figure_of(name, text)
     if figure is None:
         return None

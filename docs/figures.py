@@ -1,13 +1,13 @@
-"""The pictures of README and pages, drawn again: ``make figures``, or ``figures.py NAME ...``.
+"""Draw the pictures of README and pages: ``make figures``, or ``figures.py NAME ...``.
 
-The figures of the paper are drawn from the bundled collection, twelve synthetic brains of 40,000
-vertices, analysed with all defaults as ``s4a demo`` does; the two panels and the scene are those of
-this study in Chromium, the scene in JupyterLab. A name is that of a picture without its ending;
+The figures of the paper show the sample data: twelve synthetic brains of 40,000 vertices, analysed
+with all defaults, as by ``s4a demo``. The two panels are drawn in Chromium, and the scene in
+JupyterLab in Chromium. NAME is the name of a picture without its suffix;
 ``docs/heads.png`` is made by ``benchmarks/compare.py heads``, and ``docs/structure.svg`` by
 ``make structure``.
 
-Pictures of data that the project may use and not give away are drawn only where they are named and
-the data lie beside the checkout, into ``docs/_build``, which is not kept: ``structures_real``.
+Pictures of data that the project may not redistribute are drawn only if they are named and the data
+are next to the checkout. They are written into ``docs/_build``: ``structures_real``.
 """
 
 import re
@@ -41,11 +41,11 @@ from s4a.show.draw import (
     with_balls,
 )
 from s4a.show.pictures import mode_pictures
-from s4a.show.surfaces import mesh_of, mode_arrays, network_places, surface, transferred_colors
+from s4a.show.surfaces import mesh_of, mode_arrays, network_positions, surface, transferred_colors
 
 HERE = Path(__file__).parent
 LOCAL_FOLDER = HERE / "_build"
-DATA = HERE.parents[1] / "shared" / "data"  # beside the checkout
+DATA = HERE.parents[1] / "shared" / "data"  # next to the checkout
 VOLUMES = 24  # label volumes of hippocampi
 SHAPES, VERTICES, PAIR = 12, 40_000, 10_000
 LOOK = {"view": "corner", "up": "z"}
@@ -67,13 +67,13 @@ def collection(shapes=SHAPES, vertices=VERTICES):
 
 @cache
 def analysed(shapes=SHAPES, vertices=VERTICES):
-    """The study of the collection; its folder lasts as long as the process."""
+    """Study of the collection; its folder exists as long as the process."""
     folder = Path(tempfile.mkdtemp(prefix="s4a-figures-"))
     return s4a.analyse(collection(shapes, vertices), store=folder / "study", n_jobs=1)
 
 
 def write(figure, name, dpi=120, folder=None):
-    """A matplotlib figure on white, in 256 colours, beside this file unless a folder is named."""
+    """Write a matplotlib figure in 256 colours, next to this file or into a folder."""
     folder = HERE if folder is None else folder
     folder.mkdir(exist_ok=True)
     path = folder / f"{name}.png"
@@ -83,17 +83,17 @@ def write(figure, name, dpi=120, folder=None):
 
 
 def reduce(path, width=None):
-    """A picture in 256 colours, at most so wide."""
+    """Reduce a picture to 256 colours and to a width."""
     picture = Image.open(path).convert("RGB")
     if width is not None and picture.width > width:
         picture = picture.resize((width, round(picture.height * width / picture.width)))
-    # colours where most pixels are: those farthest apart leave shaded surfaces in stripes
+    # MEDIANCUT takes colours of most pixels; MAXCOVERAGE leaves stripes on shaded surfaces
     colours = picture.quantize(256, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
     colours.save(path, optimize=True)
 
 
 def tiled(pictures, columns=2):
-    """Pictures of one size as one, row by row."""
+    """Join pictures of one size, row by row."""
     white = np.full_like(pictures[0], 255)
     pictures = [*pictures, *[white] * (-len(pictures) % columns)]
     rows = [np.hstack(pictures[i : i + columns]) for i in range(0, len(pictures), columns)]
@@ -101,7 +101,7 @@ def tiled(pictures, columns=2):
 
 
 def near(X, T, share=0.2):
-    """The middle of a surface so large that every triangle is seen."""
+    """Enlarge the middle of a surface, so that every triangle is visible."""
     box = plane_box(X, **LOOK)
     frame = box.mean(0) + np.array([[-1], [1]]) * share * (box[1] - box[0])
     return seen(X[T].reshape(-1, 3), np.arange(T.size).reshape(-1, 3), frame=frame)
@@ -115,7 +115,7 @@ def seen(X, T, size=(240, 205), **options):
 
 
 def pipeline(study):
-    """Figure 1: input, remeshed, maps, in correspondence, and what follows."""
+    """Figure 1: input, low resolution, maps, correspondence and modes of variation."""
     template = study["registration"].attrs["template"]
     names = list(study["original"].children)
     shown = [template, *[name for name in names if name != template][:3]]
@@ -142,7 +142,7 @@ def pipeline(study):
         if picture is not None:
             ax.imshow(picture)
     pairs = study["network"].dataset
-    places = network_places(study, names)
+    places = network_positions(study, names)
     ends = [[names.index(str(n)) for n in pairs[end].values] for end in ("source", "target")]
     lines = np.stack([places[ends[0]], places[ends[1]]])  # (2, pair, 2)
     axes[2].plot(lines[..., 0], lines[..., 1], color=charts.BLUE, linewidth=0.8, alpha=0.6)
@@ -154,7 +154,7 @@ def pipeline(study):
 
 
 def swapped(vertices=6000, n_coarse=1500, stretch=1.2):
-    """Figure 2: an initial map, and eigenfunctions that change places."""
+    """Figure 2: initial map and swapped eigenfunctions."""
     brains = s4a.synthetic.brains(2, vertices)
     source, target = (brains[f"original/brain_0{i}"].to_dataset() for i in (1, 2))
     high = target.assign(position=target["position"] * [1, 1, stretch])
@@ -211,7 +211,7 @@ def components(study):
 
 
 def film(study, n_frames=36):
-    """The film at the top of README: the first three modes, from one end to the other and back."""
+    """Film at the top of README: the first three modes of variation."""
     modes, path = (1, 2, 3), HERE / "modes.gif"
     return s4a.write_film(study, path, mode=modes, width=720, n_frames=n_frames, seconds=5)
 
@@ -244,7 +244,7 @@ def variance(study):
 
 @cache
 def carried(shapes=5, vertices=PAIR):
-    """A template that is none of the collection, and the study of the others."""
+    """Template that is not in the collection, and the study of the other shapes."""
     brains = s4a.synthetic.brains(shapes, vertices, seed=0)
     meshes = {name: node.to_dataset() for name, node in brains["original"].children.items()}
     template = meshes.pop(f"brain_{shapes:02d}")
@@ -252,7 +252,7 @@ def carried(shapes=5, vertices=PAIR):
 
 
 def labels(held_out):
-    """Figure 6: labels of a template that is none of the collection, carried to a shape of it."""
+    """Figure 6: labels of a template, transferred to a shape of the collection."""
     study, template = held_out
     target = study["original"]["brain_01"].to_dataset()
     tree = s4a.transfer_labels(study, template["label"].values, source=template)
@@ -268,7 +268,7 @@ def labels(held_out):
 
 
 def landmarks(held_out):
-    """Figure 7: landmarks of the same template, and where they should be."""
+    """Figure 7: transferred landmarks of the same template, and the ground truth."""
     study, template = held_out
     target = study["original"]["brain_01"].to_dataset()
     marks = template[["landmark_name", "landmark_position"]]
@@ -297,7 +297,7 @@ def landmarks(held_out):
 
 
 def front_ends():
-    """The script that opens notebooks in Chromium."""
+    """Script that opens notebooks in Chromium."""
     sys.path.insert(0, str(HERE.parent / "benchmarks"))
     import frontends
 
@@ -305,7 +305,7 @@ def front_ends():
 
 
 def panel(widget, name, act):
-    """A picture of a panel's page in Chromium, 894 pixels wide."""
+    """Picture of the page of a panel in Chromium, 894 pixels wide."""
     from playwright.sync_api import sync_playwright
 
     front = front_ends()
@@ -325,14 +325,14 @@ def panel(widget, name, act):
 
 
 def sliders(study):
-    """Modes, the first at two standard deviations."""
+    """Panel of modes, the first at two standard deviations."""
     from s4a import widgets
 
     return panel(widgets.Modes(study), "pca", lambda page: page.evaluate(MOVE))
 
 
 def network(study):
-    """The network of functional maps."""
+    """Panel of the functional map network."""
     from s4a import widgets
 
     shown = widgets.Network(study)
@@ -355,7 +355,7 @@ view
 
 
 def scene(study):
-    """A scene of pythreejs, as a notebook in JupyterLab shows it."""
+    """Scene of pythreejs in a notebook in JupyterLab."""
     import nbformat
     from playwright.sync_api import sync_playwright
 
@@ -384,7 +384,7 @@ def scene(study):
 
 
 def reliability():
-    """The reliability diagram of confidence, from the table that ``confidence.py`` prints."""
+    """Reliability diagram of confidence, from the table that ``confidence.py`` prints."""
     text = (HERE / "decisions.md").read_text(encoding="utf-8")
     said, right = (
         [float(cell) for cell in re.search(rf"\| {row} \|(.+)\|", text)[1].split("|")]
@@ -404,7 +404,7 @@ def reliability():
 
 @cache
 def hippocampi(n=VOLUMES):
-    """The study of the anterior and the posterior part of real hippocampi."""
+    """Study of the anterior and the posterior part of real hippocampi."""
     files = sorted((DATA / "hippocampi_msd").glob("*.nii.gz"))[:n]
     if len(files) < n:
         raise ValueError(
@@ -416,7 +416,7 @@ def hippocampi(n=VOLUMES):
 
 
 def joint_modes(study, what, name, folder=LOCAL_FOLDER, n_modes=3):
-    """The first joint modes of several structures, each from above and from the side."""
+    """First joint modes of several structures, each from above and from the side."""
     found = s4a_morphometrics.structures(study)
     names = found["structure"].values.tolist()
     mean, T, steps = mode_arrays(s4a_morphometrics.structures_modes(study, found), n_modes=n_modes)
@@ -457,7 +457,7 @@ def joint_modes(study, what, name, folder=LOCAL_FOLDER, n_modes=3):
 
 
 def quickstart():
-    """Run the quickstart of README; the picture that it writes."""
+    """Run the quickstart of README and keep its picture."""
     readme = (HERE.parent / "README.md").read_text(encoding="utf-8")
     code = re.search(r"```python\n(.*?)```", readme, re.DOTALL)[1]
     path = HERE / "quickstart.png"

@@ -17,15 +17,15 @@ from nbconvert import SlidesExporter
 DOCS = Path(__file__).resolve().parent
 NOTEBOOKS = DOCS.parent / "notebooks"
 MORE = DOCS.parent / "morphometrics" / "notebooks"
-# The first cell of a notebook, in a namespace of its own, so that no cell hides a name of it:
-# what needs a kernel is shown as a page of its own, or for some values of its slider.
+# First cell of a notebook, in its own namespace, so that no cell hides its names:
+# panels are shown as pages, and sliders for some of their values.
 WITHOUT_KERNEL = f"exec({(DOCS / 'without_kernel.py').read_text(encoding='utf-8')!r}, {{}})"
 LECTURE = ("00", "04", "09")  # 45 minutes
-SHORT = 8  # lines of code that are shown
+SHORT = 8  # lines of code, at most, that a slide shows
 
 
 def as_slides(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
-    """The cells of a notebook that are shown, each with its kind of slide."""
+    """Return the notebook with the shown cells, each with its kind of slide."""
     shown, in_exercises = [], False
     for cell in notebook.cells:
         heading = cell.cell_type == "markdown" and cell.source.startswith("#")
@@ -49,7 +49,7 @@ def as_slides(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
 
 
 def executed(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
-    """The notebook with its outputs, those of panels and sliders as HTML."""
+    """Run a notebook; outputs of panels and sliders are HTML."""
     notebook.cells.insert(0, nbformat.v4.new_code_cell(WITHOUT_KERNEL))
     nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3").execute()
     del notebook.cells[0]
@@ -62,7 +62,7 @@ def executed(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
 
 
 def page(notebook: nbformat.NotebookNode, title: str, reveal: str = "") -> str:
-    """The slides as HTML."""
+    """Slides as HTML."""
     exporter = SlidesExporter()
     exporter.reveal_scroll = True
     exporter.reveal_transition = "none"
@@ -72,7 +72,7 @@ def page(notebook: nbformat.NotebookNode, title: str, reveal: str = "") -> str:
 
 
 def main() -> None:
-    """Write the slides of the lecture, or of the lessons that are named."""
+    """Write the slides of the lecture, or of the given lessons."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("lessons", nargs="*", default=LECTURE, help="how their names begin")
     parser.add_argument("--reveal", default="", help="address of a copy of reveal.js")

@@ -1,4 +1,4 @@
-"""The thumbnails at the top of the gallery: a small picture of each section, which leads to it.
+"""Thumbnails at the top of the gallery: a small picture of each section, with a link.
 
 A section is shown by the first picture that its cells make; a panel by the picture that its page
 has for a browser without WebGL.
@@ -30,7 +30,7 @@ GRID = """
 
 
 def small(content: bytes) -> str:
-    """The bytes of a picture as a thumbnail: WebP in base 64."""
+    """Thumbnail of a picture, as WebP in base 64."""
     file = io.BytesIO()
     with Image.open(io.BytesIO(content)) as picture:
         opened = picture.convert("RGBA")
@@ -42,7 +42,7 @@ def small(content: bytes) -> str:
 
 
 def picture_of(section: nodes.section, folder: Path) -> str | None:
-    """The thumbnail of a section; None where it shows no picture."""
+    """Thumbnail of a section, or None if it shows no picture."""
     for node in section.findall():
         if isinstance(node, nodes.image) and (folder / node["uri"]).is_file():
             return small((folder / node["uri"]).read_bytes())
@@ -57,7 +57,7 @@ def picture_of(section: nodes.section, folder: Path) -> str | None:
 
 
 def add(app, doctree, docname):
-    """Sphinx calls this with each page when its outputs are chosen."""
+    """Insert the thumbnails; Sphinx calls this for each page."""
     if docname != "gallery":
         return
     shown = [

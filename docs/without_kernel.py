@@ -1,4 +1,4 @@
-"""The first cell of every notebook of the documentation.
+"""First cell of every notebook of the documentation.
 
 Panels and sliders as HTML that needs no kernel.
 """
@@ -25,15 +25,15 @@ from s4a.geometry.mesh import as_arrays
 from s4a.show.browser import PARTS
 from s4a.show.draw import CLAY, data_uri, image_bytes, on_white, render
 from s4a.show.panel_page import panel_html
-from s4a.show.parts import Parts
+from s4a.show.tiled_figure import TiledFigure
 from s4a.widgets import threejs
 from s4a.widgets.explore import Explore
-from s4a.widgets.panel import OfKernel
+from s4a.widgets.panel import KernelWidget
 
-LIMIT = 1_500_000  # recorded characters of the panels of a cell, together
-MOST = 3_700_000  # letters of their pages, compressed: with pictures a page has less than 5 MB
-N_VALUES = 5  # of a slider
-# a panel is unpacked when it is first shown, and as tall as what is in it
+LIMIT = 1_500_000  # recorded characters of all panels of a cell
+MOST = 3_700_000  # characters of their compressed pages; with pictures a page has less than 5 MB
+N_VALUES = 5  # recorded values of a slider
+# a panel is decompressed when it is first shown, and as high as its content
 PANELS = """
 <div class="panels">
 <style>
@@ -82,7 +82,7 @@ PANELS = """
 </script>
 </div>
 """
-# each slider's places are strides apart in the list of all frames
+# the frames of a slider are a stride apart in the list of all frames
 SLIDERS = """
 <div class="moved">
 {% for name, labels, at, stride in sliders %}
@@ -108,17 +108,17 @@ format_of = get_ipython().display_formatter
 
 
 def framed(panel):
-    """A panel as a page within the page; of tabs all that the study has, with buttons."""
+    """Show a panel as a page within the page; tabs become buttons."""
     if isinstance(panel, Explore):
         panels = {}
         for title in panel.kinds:
-            with contextlib.suppress(ValueError):  # the study lacks what it shows
+            with contextlib.suppress(ValueError):  # the study lacks the data of the panel
                 panels[title] = panel[title]
         panel.tabs.selected_index = 0
     else:
         panels = {panel.title: panel}
     limit = LIMIT if len(panels) == 1 else 2 * LIMIT // len(panels)
-    while True:  # where the surfaces are fine, fewer values of the controls are kept
+    while True:  # fine surfaces need fewer values of the controls
         pages = [(title, packed(one, limit)) for title, one in panels.items()]
         if sum(len(page) for _, page in pages) <= MOST or limit == 0:
             break
@@ -127,17 +127,17 @@ def framed(panel):
 
 
 def packed(panel, limit):
-    """The page of a panel, compressed, in letters."""
+    """Compressed page of a panel, as text."""
     html = panel_html(panel, limit).encode()
     return base64.b64encode(gzip.compress(html, mtime=0)).decode()
 
 
-OfKernel.without_kernel = framed
+KernelWidget.without_kernel = framed
 begin_bar = bar.__init__
 
 
 def no_bar(self, *values, **options):
-    """Bars of progress are widgets, too: none is shown."""
+    """Show no progress bars, which are widgets, too."""
     begin_bar(self, *values, **options | {"disable": True})
 
 
@@ -145,7 +145,7 @@ bar.__init__ = no_bar
 
 
 def tubes(begin, end, colors, radius):
-    """Prisms in the place of lines ``(n, 3)`` to ``(n, 3)``: points, triangles, colours."""
+    """Prisms along lines ``(n, 3)`` to ``(n, 3)``: points, triangles, colours."""
     along = end - begin
     side = np.cross(along, np.eye(3)[np.abs(along).argmin(1)])
     side *= radius / np.linalg.norm(side, axis=1, keepdims=True)
@@ -158,7 +158,7 @@ def tubes(begin, end, colors, radius):
 
 
 def drawn(part, radius):
-    """Points, triangles and colours of a mesh, or of wires and lines of a radius."""
+    """Points, triangles and colours of a mesh, or of wires and lines with a radius."""
     known = part.geometry
     if isinstance(known, pythreejs.LineSegmentsGeometry):
         begin, end = np.asarray(known.positions, float).transpose(1, 0, 2)
@@ -178,7 +178,7 @@ def drawn(part, radius):
 
 
 def pictured(scene):
-    """A picture of the surfaces and lines of a scene, which turn in the notebook only."""
+    """Picture of the surfaces and lines of a scene, which rotates in the notebook only."""
     parts = list(scene.scene.children)
     parts += [
         part for group in parts if isinstance(group, pythreejs.Group) for part in group.children
@@ -223,10 +223,10 @@ format_of.formatters["text/html"].for_type(ipywidgets.HTML, lambda widget: widge
 
 
 def html_of(value):
-    """What a cell would show of a value, as HTML."""
+    """Output of a value in a cell, as HTML."""
     if value is None:
         return ""
-    if isinstance(value, Parts):
+    if isinstance(value, TiledFigure):
         return Markup(value.html())
     shown, _ = format_of.format(value)
     if "image/png" in shown:
@@ -246,7 +246,7 @@ def html_of(value):
 
 
 def values_of(slider, n):
-    """About n values of a slider, and the place among them of the one where it stands."""
+    """Return about n values of a slider, and the index of its current value."""
     if hasattr(slider, "options"):
         options = list(slider.options)
     else:
@@ -258,7 +258,7 @@ def values_of(slider, n):
 
 
 def slide(function, **sliders):
-    """In place of that of the course: the results for some values, and sliders among them."""
+    """Replace the function of the course: record some values, and show them with sliders."""
     n = N_VALUES if len(sliders) == 1 else 3
     values, places = zip(*(values_of(slider, n) for slider in sliders.values()), strict=True)
     strides = [math.prod(map(len, values[i + 1 :])) for i in range(len(values))]

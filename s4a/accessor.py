@@ -1,7 +1,4 @@
-"""The notebook panels of a study, from the library's front door.
-
-They are imported when they are first used.
-"""
+"""The notebook panels of a study, imported when they are first used."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -22,37 +19,39 @@ def explore(
     view: str = "corner",
     up: str = "z",
 ) -> "Explore":
-    """Tabs over a finished or running study, for notebooks.
+    """Show a finished or running study as tabs in a notebook.
 
-    Modes, network, maps, median, correspondence, spectrum.
+    There is a tab for each panel: modes, network, functional map, median, correspondence, ...
 
     Parameters
     ----------
     study : xarray.DataTree
-        As :func:`s4a.analyse` or :func:`s4a.open_study` give it.
+        Result of :func:`s4a.analyse` or :func:`s4a.open_study`.
     width : float or str, optional
-        Of the panels, in pixels or as CSS has it; all that the cell has by default.
+        Width of the panels, in pixels or as a CSS length; by default the width of the cell.
     font : float, optional
-        Size of their text in pixels; by default it follows their width, so that a projector shows
-        it large.
+        Font size in pixels; by default it is proportional to the width.
     view, up
-        From where surfaces are seen first, and which axis points up; see
-        :func:`s4a.show.draw.rotation`.
+        Initial direction of view, and the axis that points up; see :func:`s4a.show.draw.rotation`.
 
     Returns
     -------
     s4a.widgets.Explore
-        Whose ``close()`` frees everything; a cell that runs again closes the tabs of its run
-        before.
+        Its ``close()`` frees all widgets.  A cell that runs again closes its previous tabs.
 
     Raises
     ------
     ImportError
-        Without the packages of ``pip install s4a[notebook]``.
+        If the packages of ``pip install s4a[notebook]`` are missing.
+
+    See Also
+    --------
+    s4a.write_page : the same views of a study as one HTML file.
+    s4a.widgets : the panels one by one.
 
     Examples
     --------
-    With the ``study`` of six small brains:
+    With a study of six  small brains:
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()
@@ -66,11 +65,11 @@ def explore(
 
 @xr.register_datatree_accessor("s4a")
 class StudyAccessor:
-    """``study.s4a``: what can be done with a study."""
+    """Accessor ``study.s4a`` of a DataTree."""
 
     def __init__(self, study: xr.DataTree):
         self._study = study
 
     def explore(self, **options: Any) -> "Explore":
-        """See :func:`s4a.explore`."""
+        """Show the study as tabs; see :func:`s4a.explore`."""
         return explore(self._study, **options)

@@ -284,7 +284,7 @@ class Options:
     features: str | list[str] | None = reading(None,
         "scalar fields that guide registration, separated by commas: sulc is a.sulc.npy next to "
         "a.ply",
-        more="Or a.sulc, or a PLY property (:func:`s4a.input.annotations.files_beside`); see "
+        more="Or a.sulc, or a PLY property (:func:`s4a.input.annotations.feature_files`); see "
         ":func:`s4a.with_features` for meshes in memory")
     method: str = network("rematch",
         "low resolution by remeshing (ReMatching) or by the local functions of SCALABLE",

@@ -1,20 +1,21 @@
-"""Calibration (6.1): how sure what is reported of a part is, by the same part of other shapes.
+"""Calibration of the uncertainty of completed shapes (6.1), by leave-one-out.
 
-Two things are measured, and their variances added:
+Two errors are estimated, and their variances added:
 
-1. How far what is reported lies from the match of the whole: the part is cut out of shapes of the
-   study, matched and completed by all others (:func:`found_again`).
-2. How far that match lies from the truth.  All shapes of a study are matched to one template.
-   They are registered onto each other, too, and the way over the template is compared with the
-   direct one (:func:`between_ways`).
+1. The error of the completion relative to the match of the complete shape: shapes of the study are
+   cut to the same part, matched and completed by all others (:func:`leave_out_parts`).
+2. The error of that match relative to the ground truth.  All shapes of a study are matched to one
+   template.  Some are also registered to each other, and the path through the template is compared
+   with the direct one (:func:`between_paths`).
 
-The first holds some of the second: what the match of a left-out shape gets wrong on its own no
-other shape tells.  With p what is reported less the match and e the match less the truth, the
-variance of p + e is
+The first error includes a part of the second, the errors of a match that no other shape predicts.
+With p the completion minus the match and e the match minus the ground truth, the variance of p + e
+is
 
     var(p) + var(e) + 2 cov(p, e),
 
-and the last term is negative where p holds -e.  The direct way stands for the truth here, too.
+where the last term is negative if p contains -e.  The direct path takes the place of the ground
+truth here, too.
 """
 
 from collections.abc import Sequence
@@ -27,7 +28,7 @@ import xarray as xr
 from s4a.analysis.inputs import registration_of
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
-from s4a.input.plausibility import spread
+from s4a.input.plausibility import evenly_chosen
 from s4a.method.initial_map import transform_onto
 from s4a.method.pca import gram
 from s4a.method.register import from_latent
@@ -35,31 +36,31 @@ from s4a.method.shape import Shape
 from s4a.options import Options, kept_options
 from s4a_morphometrics import posterior
 from s4a_morphometrics.part import Pose, cut, fit_modes, part_of
-from s4a_morphometrics.partial import LEAST_SHARE, Model, match, tell, whole_of
+from s4a_morphometrics.partial import LEAST_SHARE, Model, complete_low, match, whole_of
 
-N_REMATCHED = 12  # shapes of the study whose part is matched again
-N_WAYS = 6  # of them, those that are registered onto another
-N_KEPT = 8  # studies whose ways are remembered
+N_LEFT_OUT = 12  # shapes of the study whose part is matched again
+N_DIRECT = 6  # shapes that are registered to another one
+N_CACHED = 8  # studies whose path differences are cached
 
-Gaps = dict[str, np.ndarray]  # shape -> (n_low, 3)
+Differences = dict[str, np.ndarray]  # shape -> (n_low, 3)
 
-_kept: dict[str, Gaps] = {}  # by the key of all that they depend on, the latest last
+_cache: dict[str, Differences] = {}  # by a key of all inputs, the latest last
 
 
-class Again(NamedTuple):
-    """What the same part of shapes of the study says, see :func:`again_of`."""
+class Calibration(NamedTuple):
+    """Calibrated uncertainty, see :func:`calibrate`."""
 
     noise: float
     factor: float
     added: float
-    ways: float
+    paths: float
     residual: float
 
 
 class Errors(NamedTuple):
-    """Differences ``error (m, 3)`` from the match of a whole shape, and ``at (m,)`` which vertices.
+    """Errors ``error (m, 3)`` at the vertices ``at (m,)``, relative to the complete match.
 
-    ``deviation (m, 3)``, what the distribution of what is reported says of them, or 1.
+    ``deviation (m, 3)`` is the posterior standard deviation, or 1.
     """
 
     at: np.ndarray
@@ -67,81 +68,80 @@ class Errors(NamedTuple):
     deviation: np.ndarray | float = 1.0
 
 
-class Found(NamedTuple):
-    """A shape told from its part by the others: where that is, elsewhere; residual of its fit."""
+class LeftOut(NamedTuple):
+    """Errors of a left-out shape in the present and missing regions; residual of its fit."""
 
-    there: Errors
+    present: Errors
     missing: Errors
     residual: float
 
 
-def match_again(model: Model, present: np.ndarray, density: float) -> Again:
-    """How well the same part of shapes of the study is found and completed by the others.
-
-    See :func:`found_again` and :func:`again_of`.
-    """
-    return again_of(found_again(model, present, density), gaps_between_ways(model))
+def calibrate_part(model: Model, present: np.ndarray, density: float) -> Calibration:
+    """Calibrate the completion of a part; see :func:`leave_out_parts` and :func:`calibrate`."""
+    return calibrate(leave_out_parts(model, present, density), path_differences(model))
 
 
-def found_again(model: Model, present: np.ndarray, density: float) -> dict[str, Found]:
-    """The same part of up to :data:`N_REMATCHED` shapes of the study, each told by the others.
+def leave_out_parts(model: Model, present: np.ndarray, density: float) -> dict[str, LeftOut]:
+    """Complete the same part of up to :data:`N_LEFT_OUT` shapes by the model of the others.
 
-    It is cut out of them, matched by the model of the others, completed, and compared with the
-    match of the whole shape.  Shapes of which hardly anything is left are not among them.
+    The part is cut out of each shape, matched, completed, and compared with the match of the
+    complete shape.  Shapes with too few vertices in the part are left out.
     """
     registration = registration_of(model.study)
     names = registration["shape"].values.tolist()
-    found = {}
-    for name in _rematched(registration):
+    errors = {}
+    for name in _left_out_names(registration):
         i = names.index(name)
-        one = _found_again(model, registration.isel(shape=i), i, present, density)
-        if one is not None:
-            found[name] = one
-    return found
+        left_out = _leave_out(model, registration.isel(shape=i), i, present, density)
+        if left_out is not None:
+            errors[name] = left_out
+    return errors
 
 
-def again_of(found: dict[str, Found], gaps: Gaps) -> Again:
-    """What shapes that were told by the others say of one that is reported by all.
+def calibrate(left_out: dict[str, LeftOut], differences: Differences) -> Calibration:
+    """Return the uncertainty of a completed shape from the errors of left-out shapes.
 
-    Nine tenths of all coordinates lie within the intervals of 90 %, of one variance where the part
-    is, and where nothing is of the deviations of the distribution times ``factor``, which errors of
-    the pose and of the match widen.  Of the variance ``ways`` that the matches of whole shapes
-    have, see :func:`between_ways`, the share is added that these errors lack, see
-    :func:`share_to_add`: that gives ``noise``, the variance of a coordinate where the part is, and
-    ``added``, what comes to that of the distribution where nothing is.  ``residual`` is the largest
-    of their fits.
+    The intervals of 90 % contain 90 % of all coordinates: with one variance in the present region,
+    and with ``factor`` times the posterior deviations in the missing region.  The variance
+    ``paths`` of the study's own matches, see :func:`between_paths`, is added as far as these errors
+    lack it, see :func:`share_to_add`.  The results are ``noise``, the variance of a coordinate in
+    the present region, and ``added``, the variance to add in the missing region.  ``residual`` is
+    the largest of the fits.
     """
-    ways = between_ways(gaps) ** 2
-    if not found:
-        return Again(ways, 1.0, ways, ways, np.inf)
-    noise, added = _calibrated({name: one.there for name, one in found.items()}, gaps)
-    factor, added_missing = _calibrated({name: one.missing for name, one in found.items()}, gaps)
-    residual = max(one.residual for one in found.values())
-    return Again(noise**2 + added * ways, factor, added_missing * ways, ways, residual)
+    paths = between_paths(differences) ** 2
+    if not left_out:
+        return Calibration(paths, 1.0, paths, paths, np.inf)
+    present = {name: errors.present for name, errors in left_out.items()}
+    missing = {name: errors.missing for name, errors in left_out.items()}
+    noise, added = _deviation_and_share(present, differences)
+    factor, added_missing = _deviation_and_share(missing, differences)
+    residual = max(errors.residual for errors in left_out.values())
+    return Calibration(noise**2 + added * paths, factor, added_missing * paths, paths, residual)
 
 
-def _calibrated(found, gaps):
-    """The deviation of errors beside their own, and the share of the ways' variance to add."""
-    ratios = [np.abs(one.error / one.deviation).ravel() for one in found.values()]
-    both = [(one.error, gaps[name][one.at]) for name, one in found.items() if name in gaps]
-    return deviation_of(ratios), share_to_add(both)
+def _deviation_and_share(errors, differences):
+    """Standardised deviation of errors, and the share of the path variance to add."""
+    ratios = [np.abs(e.error / e.deviation).ravel() for e in errors.values()]
+    known = [name for name in errors if name in differences]
+    pairs = [(errors[name].error, differences[name][errors[name].at]) for name in known]
+    return deviation_of(ratios), share_to_add(pairs)
 
 
-def share_to_add(told: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Which share of the variance between two ways is not in the errors of what is reported.
+def share_to_add(errors: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Return the share of the variance between two paths that completion errors lack.
 
-    With p the errors from the match and g the match less the direct way, the variance of p + g is
-    that of p and 1 + 2 (p g) / (g g) times that of g; the median over the shapes, as in
-    :func:`between_ways`, and none where it is negative.
+    With p the completion errors and g the match minus the direct path, the variance of p + g is
+    that of p plus 1 + 2 (p g) / (g g) times that of g.  The result is the median over the shapes,
+    as in :func:`between_paths`, and at least 0.
 
     Parameters
     ----------
-    told : sequence of tuple of float ndarray (m, 3)
+    errors : sequence of tuple of float ndarray (m, 3)
         p and g of each shape.
 
     Examples
     --------
-    What is reported lies off the match by what that has wrong, and by something else:
+    A completion error that is the error of the match, and one that is independent of it:
 
     >>> import numpy as np
     >>> from s4a_morphometrics.calibration import share_to_add
@@ -149,75 +149,74 @@ def share_to_add(told: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
     >>> share_to_add([(-wrong, wrong)]), share_to_add([(np.array([[0.0, 0.0, 0.1]]), wrong)])
     (0.0, 1.0)
     """
-    shares = [1 + 2 * held(p, g) for p, g in told if (g**2).sum() > 0]
+    shares = [1 + 2 * regression_slope(p, g) for p, g in errors if (g**2).sum() > 0]
     return max(0.0, float(np.median(shares))) if shares else 1.0
 
 
-def held(p: np.ndarray, e: np.ndarray) -> float:
-    """How many times the errors e of a match are in the errors p from it: cov(p, e) / var(e).
+def regression_slope(p: np.ndarray, e: np.ndarray) -> float:
+    """Return cov(p, e) / var(e), the slope of completion errors p on match errors e.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a_morphometrics.calibration import held
-    >>> held(np.array([-0.5, 0.0, 0.1]), np.array([1.0, 0.0, 0.0]))
+    >>> from s4a_morphometrics.calibration import regression_slope
+    >>> regression_slope(np.array([-0.5, 0.0, 0.1]), np.array([1.0, 0.0, 0.0]))
     -0.5
     """
     return float((p * e).sum() / (e**2).sum())
 
 
-def between_ways(gaps: Gaps) -> float:
-    """The deviation of a coordinate between two ways of matching, for unit area.
+def between_paths(differences: Differences) -> float:
+    """Return the standard deviation of a coordinate between two paths of matching, for unit area.
 
-    Three registrations have their part in it, and were their errors independent, a third of its
-    variance would be that of one.  They are not: what surfaces mislead all registrations to closes
-    every cycle, and is not seen, nor is what all matches to the template have in common, but that
-    every direct way has another template.  That is why all of it is taken for the error of one.
-    The median over the shapes: one that is matched wrong does not speak for the others.
+    Three registrations contribute.  With independent errors, one would have a third of the
+    variance.  Errors are not independent, however: those that all registrations share close every
+    cycle and are not detected.  So all of the variance is attributed to one registration.  The
+    median over the shapes is robust against a shape with a wrong match.
 
     Parameters
     ----------
-    gaps : dict
-        Of :func:`gaps_between_ways`; 0 where it is empty, of which a caller has to warn.
+    differences : dict
+        From :func:`path_differences`.  If it is empty the result is 0, and the caller must warn.
     """
-    if not gaps:
+    if not differences:
         return 0.0
-    return float(np.median([deviation_of([np.abs(gap).ravel()]) for gap in gaps.values()]))
+    return float(np.median([deviation_of([np.abs(d).ravel()]) for d in differences.values()]))
 
 
-def gaps_between_ways(model: Model) -> Gaps:
-    """Where the template's vertices lie on shapes of the study, less where the direct way has them.
+def path_differences(model: Model) -> Differences:
+    """Return positions of the template's vertices by its match, minus those by the direct path.
 
-    Up to :data:`N_WAYS` shapes are each registered onto another one of the study, by the latent
-    bases of its network; the other has each vertex of the template where its own match has it.
-    They are the same for every part: a process finds them once for the content of a study,
-    whichever tree that comes in, and remembers those of the last :data:`N_KEPT`.
+    Up to :data:`N_DIRECT` shapes are registered to another shape of the study, with the latent
+    bases of its network; the other shape has its own match to the template.  The differences do not
+    depend on the part: a process computes them once for a study, and caches the last
+    :data:`N_CACHED`.
 
     Parameters
     ----------
     model : Model
-        See :func:`s4a_morphometrics.partial.model_of`.
+        From :func:`s4a_morphometrics.partial.model_of`.
 
     Returns
     -------
     dict
-        Of shapes: float ndarray (n_low, 3), in the frame of the template.
+        Shape name -> float ndarray (n_low, 3), in the frame of the template.
     """
     registration = registration_of(model.study)
-    pairs = _pairs_of(model.study)
-    key = _key_of(model, pairs)
-    gaps = _kept.pop(key, None)
-    if gaps is None:
-        gaps = {name: _gap(model, registration, name, onto) for name, onto in pairs}
-        for old in list(_kept)[: -N_KEPT + 1]:
-            _kept.pop(old, None)
-    _kept[key] = gaps
-    return gaps
+    pairs = _direct_pairs(model.study)
+    key = _cache_key(model, pairs)
+    differences = _cache.pop(key, None)
+    if differences is None:
+        differences = {name: _difference(model, registration, name, to) for name, to in pairs}
+        for old in list(_cache)[: -N_CACHED + 1]:
+            _cache.pop(old, None)
+    _cache[key] = differences
+    return differences
 
 
-def _rematched(registration):
-    """Shapes of the study whose part is matched again."""
-    return spread(_others(registration), N_REMATCHED)
+def _left_out_names(registration):
+    """Shapes of the study that are left out in turn."""
+    return evenly_chosen(_others(registration), N_LEFT_OUT)
 
 
 def _others(registration):
@@ -225,48 +224,46 @@ def _others(registration):
     return [name for name in names if name != registration.attrs["template"]]
 
 
-def _pairs_of(study):
-    """Some of them, each with the shape that it is registered onto; none that is excluded.
-
-    None at all where fewer than two stand in the network beside the template.
-    """
+def _direct_pairs(study):
+    """Pairs of shapes in the network, without the template; empty if fewer than two remain."""
     registration, network = registration_of(study), study["latent"]["shape"].values.tolist()
     others = [name for name in _others(registration) if name in network]
-    chosen = spread([name for name in _rematched(registration) if name in network], N_WAYS)
+    left_out = [name for name in _left_out_names(registration) if name in network]
+    chosen = evenly_chosen(left_out, N_DIRECT)
     if len(others) < 2:
         return []
     half = len(others) // 2
     return [(name, others[(others.index(name) + half) % len(others)]) for name in chosen]
 
 
-def _key_of(model, pairs):
-    """The key of all that the ways between these shapes depend on."""
+def _cache_key(model, pairs):
+    """Hash of everything that the path differences depend on."""
     study = model.study
     names = sorted({name for pair in pairs for name in pair})
-    placed = ["displacement", "rotation", "translation", "scale"]
+    registered = ["displacement", "rotation", "translation", "scale"]
     contents = [
         model.template.original,
         model.template.coarse,
         study["latent"].to_dataset()[["latent_basis"]].sel(shape=names),
-        registration_of(study)[placed].sel(shape=names),
+        registration_of(study)[registered].sel(shape=names),
         *(study[node][n].to_dataset() for node in ("original", "coarse") for n in names),
     ]
-    arrays = [{str(name): values.values for name, values in one.items()} for one in contents]
+    arrays = [{str(name): values.values for name, values in data.items()} for data in contents]
     return joblib.hash([pairs, kept_options(study), arrays])
 
 
-def _gap(model, registration, name, onto):
-    """Where one shape has the vertices ``(n_low, 3)`` less where the direct way has them."""
-    one, other = (registration.sel(shape=n) for n in (name, onto))
-    X, T = as_arrays(model.study["original"][onto].to_dataset())
+def _difference(model, registration, name, to):
+    """Vertices ``(n_low, 3)`` on one shape by the template, minus those by the direct path."""
+    shape, other = (registration.sel(shape=n) for n in (name, to))
+    X, T = as_arrays(model.study["original"][to].to_dataset())
     triangle, share = closest_point(image_of(other)[model.at], X, T)
-    direct = interpolate(_direct_way(model.study, name, onto), T, triangle, share)
-    off = image_of(one)[model.at] - direct
-    return pose_of(model, one).s * off @ one["rotation"].values.T
+    direct = interpolate(_direct_match(model.study, name, to), T, triangle, share)
+    off = image_of(shape)[model.at] - direct
+    return pose_of(model, shape).s * off @ shape["rotation"].values.T
 
 
-def _direct_way(study, name, onto):
-    """Where the vertices of one shape lie on another in its file, as that is registered onto it."""
+def _direct_match(study, name, to):
+    """Register a shape to another one; return the positions of the other's vertices on it."""
     options = Options.from_report(study)
     source, target = (
         Shape(
@@ -274,10 +271,10 @@ def _direct_way(study, name, onto):
             study["coarse"][n].to_dataset(),
             **options.of("projection"),
         )
-        for n in (name, onto)
+        for n in (name, to)
     )
     Y = study["latent"].to_dataset()["latent_basis"]
-    bases = Y.sel(shape=name).values, Y.sel(shape=onto).values
+    bases = Y.sel(shape=name).values, Y.sel(shape=to).values
     transform = transform_onto(source.low, target.low)
     direct = from_latent(
         source,
@@ -291,20 +288,20 @@ def _direct_way(study, name, onto):
 
 
 def pose_of(model: Model, registered: xr.Dataset) -> Pose:
-    """The transform of a registered shape from its file into the frame of the template."""
+    """Return the transform of a registered shape from its file to the frame of the template."""
     center, size = model.template.frame
     t = (registered["translation"].values - center) / size
     return Pose(registered["rotation"].values, t, registered["scale"].item() / size)
 
 
 def image_of(registered: xr.Dataset) -> np.ndarray:
-    """Where the template's vertices ``(n, 3)`` lie on a registered shape in its file.
+    """Return the template's vertices ``(n, 3)`` on a registered shape, in the pose of its file.
 
     Parameters
     ----------
     registered : Dataset
-        ``position(vertex, xyz)`` of the template, and the displacement, rotation, translation and
-        scale of one shape.
+        ``position(vertex, xyz)`` of the template, and displacement, rotation, translation and scale
+        of one shape.
     """
     X = registered["position"].values + registered["displacement"].values
     moved = (X - registered["translation"].values) @ registered["rotation"].values
@@ -312,7 +309,7 @@ def image_of(registered: xr.Dataset) -> np.ndarray:
 
 
 def deviation_of(errors: Sequence[np.ndarray]) -> float:
-    """The standard deviation with whose interval of 90 % nine tenths of all errors agree.
+    """Return the standard deviation whose interval of 90 % contains 90 % of the errors.
 
     Examples
     --------
@@ -321,20 +318,20 @@ def deviation_of(errors: Sequence[np.ndarray]) -> float:
     >>> round(deviation_of([np.full(9, 1.6449), np.array([8.0])]), 2)
     1.39
     """
-    every = np.concatenate(errors)
-    return float(np.quantile(every, 0.9)) / posterior.WITHIN_90 if len(every) else 0.0
+    values = np.concatenate(errors)
+    return float(np.quantile(values, 0.9)) / posterior.WITHIN_90 if len(values) else 0.0
 
 
-def _found_again(model, registered, i, present, density):
-    """Shape i told from its part by the others; None where hardly anything is left."""
+def _leave_out(model, registered, i, present, density):
+    """Complete shape i from its part by the others; None if too few vertices remain."""
     study, name = model.study, registered["shape"].item()
     mesh = study["original"][name].to_dataset().load()
     X, T = as_arrays(mesh)
     there = model.template.U @ present.astype(float) > 0.5
     back = study["registration"][name]["template_triangle"].values
-    kept = there[model.template.full.T[back]].sum(1) >= 2  # (n_original,)
+    keep = there[model.template.full.T[back]].sum(1) >= 2  # (n_original,)
     pose = pose_of(model, registered)
-    part = part_of(*cut(X, T, kept))
+    part = part_of(*cut(X, T, keep))
     if len(part.X) < 100:
         return None
     used = np.delete(np.arange(len(model.fields)), i)
@@ -354,13 +351,13 @@ def _found_again(model, registered, i, present, density):
     def errors(image, at, deviation=1.0):
         return Errors(at, error(image)[at], deviation)
 
-    there = errors(low, np.flatnonzero(again & present))
+    at_present = errors(low, np.flatnonzero(again & present))
     missing = np.flatnonzero(~again & ~present)
     if not len(missing) or model.area @ again < LEAST_SHARE:
-        return Found(there, errors(low, missing[:0]), fit.residual)
+        return LeftOut(at_present, errors(low, missing[:0]), fit.residual)
     known = posterior.know(
         fields, model.template.low.Phi, model.X, model.area, again, scale=model.scale
     )
-    told = tell(rest, known, low, density)
-    deviation = np.sqrt((told.spread[:, missing] ** 2).sum(0) + known.rest)
-    return Found(there, errors(told.image, missing, deviation), fit.residual)
+    completion = complete_low(rest, known, low, density)
+    deviation = np.sqrt((completion.deviation[:, missing] ** 2).sum(0) + known.rest)
+    return LeftOut(at_present, errors(completion.image, missing, deviation), fit.residual)

@@ -39,7 +39,7 @@ def asymmetry(
     out: str | None = None,
     seed: int,
 ) -> int:
-    """How left and right differ: shares of variance, directional asymmetry, antisymmetry.
+    """Analyse asymmetry: shares of variance, directional asymmetry, antisymmetry.
 
     Every shape against its mirror image, or both sides of every subject.
 
@@ -48,15 +48,15 @@ def asymmetry(
     study : STUDY
         its folder
     subject : COLUMN
-        of left and right shapes: whose each is (without, every shape against its mirror image)
+        subject of each left and right shape (default: every shape and its mirror image)
     side : COLUMN
-        and of which side
+        side of each shape
     of
         what is tested at every vertex: along the normals, or vectors
     table : PATH
         CSV with a column 'shape', in place of the table of the study
     include_flagged
-        take flagged shapes in
+        include flagged shapes
     permutations : N
         changes of sign (default: 999)
     out : FOLDER
@@ -92,7 +92,7 @@ def growth(
     out: str | None = None,
     seed: int,
 ) -> int:
-    """How shape changes with time in subjects that were seen several times; its animation.
+    """Test and animate the change of shape with time in repeated observations of subjects.
 
     Parameters
     ----------
@@ -101,19 +101,19 @@ def growth(
     time : COLUMN
         age, or time since the first visit
     subject : COLUMN
-        whose each shape is
+        subject of each shape
     covariates : COLUMN
-        accounted for
+        covariates
     field : NAME
-        a field of s4a fields in place of shape
+        name of a field of s4a fields, in place of shape
     of
         what is tested at every vertex: vectors, or along the normals
     variances
-        unequal where subjects change differently: signs of subjects
+        unequal if the subjects differ in variance; signs of subjects are then permuted
     table : PATH
         CSV with a column 'shape', in place of the table of the study
     include_flagged
-        take flagged shapes in
+        include flagged shapes
     permutations : N
         of visits within subjects (default: 999)
     out : FOLDER
@@ -150,7 +150,7 @@ def covariation(
     out: str | None = None,
     seed: int,
 ) -> int:
-    """How a field of s4a fields varies together with shape: partial least squares.
+    """Analyse the covariation of a field with shape by partial least squares.
 
     Parameters
     ----------
@@ -159,11 +159,11 @@ def covariation(
     field : FIELD
         name of a field of s4a fields
     covariates : COLUMN
-        accounted for
+        covariates
     table : PATH
         CSV with a column 'shape', in place of the table of the study
     include_flagged
-        take flagged shapes in
+        include flagged shapes
     permutations : N
         of the shapes (default: 999)
     out : FOLDER
@@ -191,7 +191,7 @@ def complete(
     components: int | str | None = None,
     seed: int,
 ) -> int:
-    """A part of a shape matched to a finished study, and the whole that it may be of.
+    """Match a part of a shape to a finished study, and estimate the whole shape.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def complete(
     landmarks : PATH
         landmarks of the part, three or more with names of the template's, which guide registration
     samples : N
-        shapes drawn from all that agree with the part
+        shapes to draw from those that agree with the part
     components : COMPONENTS
         'largest', 'all' or how many pieces of the part to keep (default: as in the study)
     """
@@ -234,19 +234,18 @@ def export(
     labels: str | None = None,
     grid: str | None = None,
 ) -> int:
-    """A study in the files of Slicer, ShapeWorks, Scalismo, ParaView, R, or as label volumes.
+    """Write a study for Slicer, ShapeWorks, Scalismo, ParaView, R, or as label volumes.
 
     Parameters
     ----------
     study : STUDY
         its folder
     to
-        for which program
+        target program
     out : FOLDER
         for its files
     points : N
-        slicer, shapeworks, r: vertices that are points or particles, as far apart as can be
-        (default: 500)
+        slicer, shapeworks, r: farthest-point samples (default: 500)
     modes : N
         scalismo, paraview: the first modes (default: all; paraview: 3)
     template_landmarks : FILE
@@ -254,7 +253,7 @@ def export(
     labels : FILE
         nifti: labels of the template's vertices, whole numbers (default: its own)
     grid : FILE
-        nifti: volume whose voxels are labelled (default: that each shape was made of)
+        nifti: volume whose voxels are labelled (default: the volume of each shape)
     """
     from s4a_morphometrics import write_for
     from s4a_morphometrics.statistics_commands import template_labels

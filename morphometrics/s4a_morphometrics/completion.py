@@ -1,8 +1,8 @@
-"""Partial shapes (6.1, outlook): a part matched where it is, and the whole that it may be of.
+"""Completion of partial shapes (6.1, outlook) by the shape model of a study.
 
-What the modes of a finished study say of the rest, see :mod:`s4a_morphometrics.partial` and
-:mod:`s4a_morphometrics.posterior`; how the part is matched, see :mod:`s4a_morphometrics.part`;
-how sure all of that is, see :mod:`s4a_morphometrics.calibration`.
+:mod:`s4a_morphometrics.part` matches the partial shape, :mod:`s4a_morphometrics.posterior` and
+:mod:`s4a_morphometrics.partial` compute the distribution of the missing region, and
+:mod:`s4a_morphometrics.calibration` calibrates its uncertainty.
 """
 
 import logging
@@ -28,28 +28,28 @@ from s4a.schema import check_count, dataset, in_unit
 from s4a.seeds import RNG, seed_of
 from s4a.study.insert import read_new
 from s4a_morphometrics import posterior
-from s4a_morphometrics.calibration import match_again
+from s4a_morphometrics.calibration import calibrate_part
 from s4a_morphometrics.part import (
     Fit,
     Part,
     Pose,
     Whole,
     best_fit,
-    different,
+    distinct,
     fit_modes,
     part_of,
-    rough_starts,
-    seen,
+    present_vertices,
+    rough_poses,
 )
-from s4a_morphometrics.partial import LEAST_SHARE, Model, match, model_of, tell, whole_of
+from s4a_morphometrics.partial import LEAST_SHARE, Model, complete_low, match, model_of, whole_of
 
 log = logging.getLogger(__name__)
 
-TESTED_SHARE = 0.45  # with less the intervals have not been tested
-LEAST_INSIDE = 0.6  # share of the part that must lie on the whole
-SURELY_INSIDE = 0.95  # with less every way is looked at once more
-FOREIGN = 1.4  # times what the modes of the others leave of any shape of the study
-N_AGAIN = 48  # starts of a part that the modes do not fit
+TESTED_SHARE = 0.45  # smallest present share for which the intervals were validated
+LEAST_INSIDE = 0.6  # smallest share of the partial shape on the complete one
+SURELY_INSIDE = 0.95  # below this share, more rotations are tried
+FOREIGN = 1.4  # residual, relative to the largest of a shape of the study
+N_AGAIN = 48  # initialisations if the modes do not fit
 
 
 def complete(
@@ -62,58 +62,65 @@ def complete(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """A part of a shape matched to a finished study, and the whole that it may be of.
+    """Match a partial shape to a finished study, and complete it by the shape model.
 
-    What is missing is found.  Where the part is, the completed shape lies on it; elsewhere it is
-    the mean of all shapes that agree with the part under the modes of the study and what these do
-    not hold, a normal distribution (posterior shape model, Albrecht et al. 2013; the formula is in
-    :mod:`s4a_morphometrics.posterior`).  Its standard deviations are such that nine tenths of what
-    shapes of the study have there, each cut in the same way, matched and completed by all others,
-    lie within intervals of 90 %, and wider by what two ways of matching the study's shapes differ,
-    over the template and directly, as far as that is not in the former (see
-    :mod:`s4a_morphometrics.calibration`).  The intervals are for shapes of the population of the
-    study's; what surfaces mislead every match to is not in them.
+    The missing region is detected.  In the present region the completed shape follows the partial
+    shape; elsewhere it is the posterior mean given the partial shape (posterior shape model, see
+    :mod:`s4a_morphometrics.posterior`).  The standard deviations are calibrated by leave-one-out:
+    shapes of the study are cut in the same way, matched and completed by the others, and 90 % of
+    their coordinates lie within intervals of 90 %.  The uncertainty of the study's own
+    correspondences is added, estimated from direct matches between shapes and matches through the
+    template (see :mod:`s4a_morphometrics.calibration`).  The intervals hold for shapes of the same
+    population.  They do not include errors that all matches have in common.
 
     Parameters
     ----------
     study : DataTree
-        Of :func:`s4a.analyse` or :func:`s4a.open_study`, with modes; it stays as it is.
+        From :func:`s4a.analyse` or :func:`s4a.open_study`, with modes; not changed.
     part : path, tuple (points, triangles) or Dataset
-        A mesh, in any pose; whole shapes are parts without anything missing.
+        A mesh in any pose; a complete shape is a partial shape with no missing region.
     landmarks : path, optional
-        Its landmarks; three or more that the template has by name, too, say how it lies.
+        Landmarks of the mesh.  Three or more with names of the template's landmarks fix the pose.
     components : "largest" or int, optional
-        How many pieces of the part are taken, see :func:`s4a.clean`; as in the study by default.
+        Connected components to keep, see :func:`s4a.clean`; by default as in the study.
     n_samples : int
-        Shapes drawn from the distribution.
+        Number of random shapes from the distribution.
     seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
     Dataset
-        A mesh with the template's triangles: ``position(vertex, xyz)`` where the part lies in its
-        file, ``present(vertex)``, ``completion_sd(vertex, xyz)`` along the axes of the file and
+        A mesh with the template's triangles: ``position(vertex, xyz)`` in the pose of the file,
+        ``present(vertex)``, ``completion_sd(vertex, xyz)`` along the axes of the file and
         ``completion_normal_sd(vertex)``, ``sample_position(sample, vertex, xyz)``;
         ``score(component)``, ``score_covariance(component, component_2)``; and, as in
         ``/registration``, ``displacement``, ``rotation``, ``translation`` and ``scale``.
-        Attributes: ``template``; ``missing``, share of the template's area; ``residual``, the
-        distance that modes and transform leave on the part, ``usual_residual``, the largest that
-        the modes of the others leave on the same part of a shape of the study, and ``inside``, the
-        share of the part's points that lie on the whole; ``match_noise``, the deviation of a
-        coordinate where the part is; where nothing is ``factor`` of what the modes leave, and
-        ``added``, the deviation that comes to it of ``between_ways``, that between two ways of
-        matching; and ``left_out_error``, the root mean square error of a coordinate with which the
-        study's own shapes are reported by the others there; ``warning``.
+        Attributes: ``template``; ``missing``, share of the template's area; ``residual``, distance
+        between the fitted modes and the partial shape; ``usual_residual``, its largest value for
+        shapes of the study in leave-one-out; ``inside``, share of the points on the complete shape;
+        ``match_noise``, standard deviation of a coordinate in the present region; for the missing
+        region the ``factor`` of the posterior deviations, ``added``, the standard deviation added
+        from ``between_paths``, that between the two paths of matching; ``left_out_error``, root
+        mean square error of a coordinate in leave-one-out; ``warning``.
 
     Raises
     ------
     ValueError
-        When the study has no modes, the part cannot be read, it has less than 15 % of the template,
-        or lies nowhere on its shapes.
+        If the study has no modes, or the mesh cannot be read, has less than 15 % of the template or
+        does not fit the shapes.
+
+    See Also
+    --------
+    s4a.insert : adds complete shapes to a study.
+
+    References
+    ----------
+    T. Albrecht, M. Luethi, T. Gerig and T. Vetter (2013), Posterior shape models, Medical Image
+    Analysis 17(8).
 
     Examples
     --------
-    With the ``study`` of six small brains; of one of these the upper half:
+    The upper half of a brain of a small study:
 
     >>> import s4a
     >>> import s4a_morphometrics
@@ -125,32 +132,32 @@ def complete(
     >>> 0.4 < found.attrs["missing"] < 0.6
     True
 
-    The shape of which the upper half was given, and how sure each place of it is:
+    The complete brain, and the completed one with its standard deviation:
 
     >>> shown = {"the shape": mesh, "completed, with its deviation": found}
-    >>> sure = {"completed, with its deviation": found["completion_normal_sd"].values}
-    >>> s4a.show.charts.surfaces(shown, sure, label="mm")
-    <Parts ...>
+    >>> deviation = {"completed, with its deviation": found["completion_normal_sd"].values}
+    >>> s4a.show.charts.surfaces(shown, deviation, label="mm")
+    <TiledFigure ...>
     """
     check_count("n_samples", n_samples)
     model = model_of(study)
     mesh = read_part(study, part, components, landmarks)
-    pieces = part_of(*as_arrays(mesh))
-    first = first_pose(study, model)
-    fit, whole = place(pieces, model, first, mesh)
-    check_place(fit, model)
-    low, present, fit = match(pieces, model, whole, fit)
+    partial = part_of(*as_arrays(mesh))
+    usual = usual_pose(study, model)
+    fit, whole = fit_part(partial, model, usual, mesh)
+    check_fit(fit, model)
+    low, present, fit = match(partial, model, whole, fit)
     share = float(model.area @ present)
     if share < LEAST_SHARE:
         raise ValueError(
-            f"a part with at least {100 * LEAST_SHARE:.0f} % of the template's area is needed, "
+            f"a partial shape needs at least {100 * LEAST_SHARE:.0f} % of the template's area; "
             f"found {100 * share:.1f} %"
         )
     known = posterior.know(
         model.fields, model.template.low.Phi, model.X, model.area, present, scale=model.scale
     )
     generator = np.random.default_rng(seed_of(seed, rng))
-    result = completed(model, pieces, fit, known, low, n_samples, generator)
+    result = completed(model, partial, fit, known, low, n_samples, generator)
     template = model.template.original
     result = in_unit(result, common_unit(template, mesh))
     result.attrs["template"] = study["registration"].attrs["template"]
@@ -166,23 +173,24 @@ def read_part(
     components: str | int | None = None,
     landmarks: Path | str | None = None,
 ) -> xr.Dataset:
-    """The clean mesh of a part: its holes stay open."""
+    """Read and clean a partial shape; its holes stay open."""
     given = {"close_holes": False} | ({} if components is None else {"components": components})
     options = Options.from_report(study).changed(given)
     if isinstance(part, str | Path) and not Path(part).exists():
-        raise ValueError(f"{shown(part)}: there is no such file")
+        raise ValueError(f"{shown(part)}: no such file")
     meshes, attrs = read_new(part if isinstance(part, str | Path) else {"part": part}, options)
     if len(meshes) != 1:
-        reasons = [f"{name}: {one['reason']}" for name, one in attrs.items() if name not in meshes]
+        reasons = [f"{name}: {a['reason']}" for name, a in attrs.items() if name not in meshes]
         raise ValueError(
-            f"one part needed, found {len(meshes)}: {', '.join(meshes)}{'; '.join(reasons)}"
+            f"one partial shape is needed; found {len(meshes)}: "
+            f"{', '.join(meshes)}{'; '.join(reasons)}"
         )
     (mesh,) = meshes.values()
     return mesh if landmarks is None else with_landmarks(mesh, landmarks)
 
 
-def first_pose(study: xr.DataTree, model: Model) -> Pose:
-    """How the shapes of the study lie in their files, on average."""
+def usual_pose(study: xr.DataTree, model: Model) -> Pose:
+    """Return the mean pose of the shapes of a study in their files."""
     registration = registration_of(study)
     U, S, Vt = np.linalg.svd(registration["rotation"].values.mean(0))
     R = (U * [1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt if S[-1] > 0.5 else np.eye(3)
@@ -192,60 +200,57 @@ def first_pose(study: xr.DataTree, model: Model) -> Pose:
     return Pose(R, (t - center) / size, s / size)
 
 
-def place(
-    part: Part, model: Model, first: Pose, mesh: xr.Dataset | None = None
+def fit_part(
+    part: Part, model: Model, usual: Pose, mesh: xr.Dataset | None = None
 ) -> tuple[Fit, Whole]:
-    """Where a part lies on the shapes of a study, and these at low resolution."""
+    """Fit a partial shape to the shape model of a study at low resolution."""
     whole = whole_of(model)
-    pose = None if mesh is None else pose_of_landmarks(mesh, model, whole.X, first)
+    pose = None if mesh is None else pose_of_landmarks(mesh, model, whole.X, usual)
     if pose is not None:
         return fit_modes(part, whole, pose, free_size=model.scale), whole
-    starts = different(rough_starts(part, whole, first), first, part)
-    fit = best_fit(part, whole, starts, first, model.scale)
-    if fit.residual > FOREIGN * left_by_others(model) or fit.inside < SURELY_INSIDE:
-        # it lies another way, or is of another kind: every way is looked at once more
-        ends = rough_starts(part, whole, first, turns="I")
-        starts = [fit.pose, *different(ends, first, part, N_AGAIN)]
-        fit = best_fit(part, whole, starts, first, model.scale)
+    poses = distinct(rough_poses(part, whole, usual), usual, part)
+    fit = best_fit(part, whole, poses, usual, model.scale)
+    if fit.residual > FOREIGN * largest_residual(model) or fit.inside < SURELY_INSIDE:
+        # an unusual pose, or another kind of shape: try more rotations
+        results = rough_poses(part, whole, usual, rotations="I")
+        poses = [fit.pose, *distinct(results, usual, part, N_AGAIN)]
+        fit = best_fit(part, whole, poses, usual, model.scale)
     return fit, whole
 
 
-def left_by_others(model: Model) -> float:
-    """The root mean square along the normals that the modes of the others leave of a shape at most.
-
-    Of a whole shape in its place, for unit area.
-    """
+def largest_residual(model: Model) -> float:
+    """Return the largest leave-one-out residual of a shape along the normals, for unit area."""
     fields = model.fields - model.fields.mean(0)
     weights = posterior.residual_weights(gram(fields, model.area))
-    left = np.einsum("st,tnx->snx", weights, fields, optimize=True)
-    off = normal_displacement(left, vertex_normals(model.X, model.template.low.T))
+    residual = np.einsum("st,tnx->snx", weights, fields, optimize=True)
+    off = normal_displacement(residual, vertex_normals(model.X, model.template.low.T))
     return float(np.sqrt((off**2 @ model.area).max()))
 
 
-def pose_of_landmarks(mesh: xr.Dataset, model: Model, mean: np.ndarray, first: Pose) -> Pose | None:
-    """The transform of three or more landmarks that part and template have by name, if they do."""
+def pose_of_landmarks(mesh: xr.Dataset, model: Model, mean: np.ndarray, usual: Pose) -> Pose | None:
+    """Return the pose from three or more common landmarks, or None if there are fewer."""
     names, weights = model.template.landmarks
-    own = mesh["guide_name"].values.tolist() if "guide_name" in mesh else []
-    common = [name for name in names if name in own]
+    given = mesh["guide_name"].values.tolist() if "guide_name" in mesh else []
+    common = [name for name in names if name in given]
     if len(common) < 3:
-        if own:
-            log.warning("part and template have %d landmarks in common: 3 needed", len(common))
+        if given:
+            log.warning("3 landmarks in common with the template are needed; found %d", len(common))
         return None
-    P = mesh["guide_position"].values[[own.index(name) for name in common]]
+    P = mesh["guide_position"].values[[given.index(name) for name in common]]
     rows = weights[[names.index(name) for name in common]]
     shift = model.template.U @ (mean - model.X)
     Q = rows @ (model.template.full.X + shift)
     R, _, _ = rigid_transform(P, Q)
-    return Pose(R, Q.mean(0) - first.s * R @ P.mean(0), first.s)
+    return Pose(R, Q.mean(0) - usual.s * R @ P.mean(0), usual.s)
 
 
-def check_place(fit: Fit, model: Model) -> None:
-    """ValueError where a part does not lie on the shapes of the study."""
+def check_fit(fit: Fit, model: Model) -> None:
+    """Raise ValueError if a partial shape does not fit the shapes of the study."""
     if fit.inside < LEAST_INSIDE:
         raise ValueError(
-            f"the part does not fit the shapes of the study: only {100 * fit.inside:.0f} % of it "
-            "lies on one that they may be; is it of another kind, or another unit? Three landmarks "
-            "that the template has, too, say how it lies (landmarks=)"
+            f"the partial shape does not fit the study: {100 * fit.inside:.0f} % of it lies on "
+            "the best fit. Is it another kind of shape, or in another unit? Three "
+            "landmarks in common with the template fix its pose (landmarks=)"
         )
 
 
@@ -258,28 +263,29 @@ def completed(
     n_samples: int,
     rng: np.random.Generator,
 ) -> xr.Dataset:
-    """The distribution of the whole when its low resolution is known where it is present."""
+    """Return the completed shape with its distribution, given the known coarse vertices."""
     target, present = model.template, known.present
     density, left_out_error = 1.0, 0.0
     if not present.all():
         density, left_out_error = posterior.best_density(known, ~present)
-    again = match_again(model, present, density)
-    told = tell(model, known, low, density)
-    placed = _most_likely(model, told)  # (n_full, 3)
+    calibration = calibrate_part(model, present, density)
+    completion = complete_low(model, known, low, density)
+    placed = _posterior_mean(model, completion)  # (n_full, 3)
 
-    inflate = np.where(present, 1.0, again.factor)  # (n_low,)
-    spread = told.spread * inflate[:, None]
-    white = np.where(present, again.noise, again.added + again.factor**2 * known.rest)
-    full = target.U @ _covariance(spread, white).reshape(-1, 9)
+    inflate = np.where(present, 1.0, calibration.factor)  # (n_low,)
+    deviation = completion.deviation * inflate[:, None]
+    missing_noise = calibration.added + calibration.factor**2 * known.rest
+    white = np.where(present, calibration.noise, missing_noise)
+    full = target.U @ _covariance(deviation, white).reshape(-1, 9)
 
     pose, size = fit.pose, 1 / fit.pose.s
-    there = seen(
+    there = present_vertices(
         placed, vertex_normals(placed, target.full.T), part, pose(part.X), max(0.02, fit.residual)
     )
     position = size * (placed - pose.t) @ pose.R
     normals = vertex_normals(position, target.full.T)
     in_file = size**2 * np.einsum("xi,nxy,yj->nij", pose.R, full.reshape(-1, 3, 3), pose.R)
-    low_samples = _low_samples(model, spread, white, n_samples, rng)
+    low_samples = _low_samples(model, deviation, white, n_samples, rng)
     drawn = [position + size * (target.U @ moved) @ pose.R for moved in low_samples]
     area = vertex_areas(*as_arrays(target.original))
     X = target.original["position"].values
@@ -289,12 +295,12 @@ def completed(
         {
             "missing": float(1 - area @ there / area.sum()),
             "residual": size * fit.residual,
-            "usual_residual": size * again.residual,
+            "usual_residual": size * calibration.residual,
             "inside": fit.inside,
-            "factor": again.factor,
-            "match_noise": size * float(np.sqrt(again.noise)),
-            "between_ways": size * float(np.sqrt(again.ways)),
-            "added": size * float(np.sqrt(again.added)),
+            "factor": calibration.factor,
+            "match_noise": size * float(np.sqrt(calibration.noise)),
+            "between_paths": size * float(np.sqrt(calibration.paths)),
+            "added": size * float(np.sqrt(calibration.added)),
             "left_out_error": size * left_out_error,
         },
         position=position,
@@ -305,8 +311,8 @@ def completed(
             np.float32
         ),
         sample_position=np.reshape(drawn, (n_samples, len(X), 3)).astype(np.float32),
-        score=told.weights.mean[:c],
-        score_covariance=told.weights.root[:c] @ told.weights.root[:c].T,
+        score=completion.weights.mean[:c],
+        score_covariance=completion.weights.root[:c] @ completion.weights.root[:c].T,
         displacement=d.astype(np.float32),
         rotation=R,
         translation=t,
@@ -314,67 +320,68 @@ def completed(
     )
 
 
-def _most_likely(model, told):
-    """The mean of the posterior ``(n_full, 3)``."""
+def _posterior_mean(model, completion):
+    """Return the posterior mean ``(n_full, 3)``."""
     c = len(model.modes)
-    b = told.weights.mean[:c]
+    b = completion.weights.mean[:c]
     exact = model.mean_full + np.tensordot(b, model.modes_full, 1)
-    # the modes have detail that U has not
-    rest = told.image - model.X - model.fields.mean(0) - np.tensordot(b, told.columns[:c], 1)
+    # the modes have detail at full resolution that U lacks
+    coarse = np.tensordot(b, completion.columns[:c], 1)
+    rest = completion.image - model.X - model.fields.mean(0) - coarse
     return model.template.full.X + exact + model.template.U @ rest
 
 
-def _covariance(spread, white):
-    """Of each vertex ``(n_low, 3, 3)``: of the fields and of what every vertex has alone."""
-    covariance = np.einsum("rnx,rny->nxy", spread, spread, optimize=True)
+def _covariance(deviation, white):
+    """Covariance of each vertex ``(n_low, 3, 3)``: of the fields, plus independent noise."""
+    covariance = np.einsum("rnx,rny->nxy", deviation, deviation, optimize=True)
     covariance[:, range(3), range(3)] += white[:, None]
     return covariance
 
 
-def _low_samples(model, spread, white, n, rng):
-    """Draws from the posterior about its mean, each ``(n_low, 3)``."""
+def _low_samples(model, deviation, white, n, rng):
+    """Draw n samples ``(n_low, 3)`` from the posterior, relative to its mean."""
     target = model.template
     rough = posterior.rough_fields(target.W, model.area, float(target.low.eigenvalue[-1]))
     for _ in range(n):
-        moved = np.tensordot(rng.standard_normal(len(spread)), spread, 1)
+        moved = np.tensordot(rng.standard_normal(len(deviation)), deviation, 1)
         yield moved + np.sqrt(white)[:, None] * rough(rng)
 
 
 def warnings_of(result: xr.Dataset) -> list[str]:
-    """What looks wrong with a part."""
-    said = []
+    """Return warnings on a completed shape."""
+    warnings = []
     ratio = result.attrs["residual"] / result.attrs["usual_residual"]
     if ratio > FOREIGN:
-        said.append(
-            f"the modes leave {ratio:.1f} times as much of the part as of any shape of the study: "
-            "it may be of another kind, or lie another way than was found, which landmarks say"
+        warnings.append(
+            f"the residual is {ratio:.1f} times the largest of a shape of the study: the partial "
+            "shape may be another kind of shape, or its pose may be wrong; landmarks fix the pose"
         )
     score = result["score"].values
     p = float(stats.chi2.sf(score @ score, len(score)))
     if p < 1e-4:
-        said.append(
-            f"the scores of the part lie {np.sqrt(score @ score):.1f} from the mean, where "
-            f"{np.sqrt(len(score)):.1f} is usual: it may be of another kind"
+        warnings.append(
+            f"the Mahalanobis distance of the scores is {np.sqrt(score @ score):.1f}, where "
+            f"{np.sqrt(len(score)):.1f} is usual: it may be another kind of shape"
         )
-    if result.attrs["between_ways"] == 0:
-        said.append(
-            "how far matches of whole shapes are off could not be measured, which takes two shapes "
-            "in the network beside the template: the intervals are too narrow by it"
+    if result.attrs["between_paths"] == 0:
+        warnings.append(
+            "the errors of the study's correspondences could not be estimated, which needs two "
+            "shapes in the network besides the template: the intervals are too narrow"
         )
     if result.attrs["missing"] > 1 - TESTED_SHARE:
         missing = 100 * result.attrs["missing"]
-        said.append(f"{missing:.0f} % are missing: the intervals are tested up to half")
-    return said
+        warnings.append(f"{missing:.0f} % are missing; the intervals were validated up to half")
+    return warnings
 
 
 def write_completed(found: xr.Dataset, folder: Path | str) -> list[Path]:
-    """Write what :func:`s4a_morphometrics.complete` found.
+    """Write the result of :func:`s4a_morphometrics.complete`.
 
     Parameters
     ----------
     found : Dataset
     folder : path
-        Made where it is missing.
+        Created if missing.
 
     Returns
     -------

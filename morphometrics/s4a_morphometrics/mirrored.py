@@ -14,8 +14,8 @@ import s4a
 from s4a.input.chirality import (
     COMMON_SIDE,
     OTHER_SIDE,
-    hands,
     is_mirrored,
+    mean_chirality,
     mirrored_shapes,
     rarer_side,
 )
@@ -75,13 +75,13 @@ def find_mirrored_new(
 
 
 def seen_together(looks: Looks) -> dict[str, xr.Dataset]:
-    """What several structures of each subject say together, for :func:`s4a.input.chirality.hands`.
+    """Combine the chirality of several structures of each subject.
 
     Returns
     -------
     dict of str to Dataset
-        Subject -> ``hand(reference)``, the sum over the n structures that both have, over sqrt(n):
-        their noise is then that of one.  NaN where they have none.
+        Subject -> ``chirality(reference)``, for :func:`s4a.input.chirality.mean_chirality`: the sum
+        over the n structures that both have, over sqrt(n), as noisy as one.  NaN if they have none.
 
     Examples
     --------
@@ -120,7 +120,7 @@ def mirrored_subjects(looks: Looks) -> tuple[dict[str, float], list[str], list[s
     Returns
     -------
     hand : dict of str to float
-        Of every subject, as of :func:`s4a.input.chirality.hands`.
+        Of every subject, as of :func:`s4a.input.chirality.mean_chirality`.
     names : list of str
         Those of the rarer side.
     remarks : list of str
@@ -130,7 +130,7 @@ def mirrored_subjects(looks: Looks) -> tuple[dict[str, float], list[str], list[s
     together = seen_together(looks)
     if len(together) < 2:
         return dict.fromkeys(together, np.nan), *mirrored_shapes(together)
-    names, mean = list(together), hands(together)
+    names, mean = list(together), mean_chirality(together)
     hand = dict(zip(names, mean.tolist(), strict=True))
     table = hand_table(looks, names, names) * np.where(mean < 0, -1, 1)
     known = np.isfinite(table)

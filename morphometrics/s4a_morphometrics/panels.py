@@ -1,4 +1,4 @@
-"""The panel of left against right, for notebooks."""
+"""Panel of bilateral asymmetry for notebooks."""
 
 from typing import Any
 
@@ -11,23 +11,23 @@ from s4a.widgets.maps import POSITIVE_MAPS, SIGNED_MAPS, Maps
 from s4a.widgets.panel import WIDE, dropdown, row
 
 INDIVIDUAL = "individual"
-OF = "whose asymmetry is shown, along the normals"
+TOOLTIP = "the individual whose asymmetry along the normals is shown"
 
 
 class Asymmetry(Maps):
-    """Directional and fluctuating asymmetry at every vertex, and that of each individual.
+    """Show directional and fluctuating asymmetry at each vertex, and that of each individual.
 
-    Grey where the directional one is not significant; a click tells the values there.
+    Vertices without significant directional asymmetry are grey; a click shows the values.
 
     Parameters
     ----------
     study : xarray.DataTree
-        That was tested.
-    found : xarray.Dataset, optional
-        Of :func:`s4a_morphometrics.asymmetry`; by default ``/asymmetry`` of the study, with which
-        ``s4a.explore`` has a tab of it.
+        The tested study.
+    result : xarray.Dataset, optional
+        From :func:`s4a_morphometrics.asymmetry`; by default ``/asymmetry`` of the study, which also
+        gives ``s4a.explore`` a tab.
     view, up
-        From where the surface is seen first; see :func:`s4a.show.draw.rotation`.
+        Initial view of the surface; see :func:`s4a.show.draw.rotation`.
 
     Examples
     --------
@@ -55,32 +55,32 @@ class Asymmetry(Maps):
         super().__init__(study, found, **options)
 
     def build(self, **options: Any) -> list[ipywidgets.Widget]:
-        """Choices, of an individual too, and the surface."""
+        """Return the controls and the surface."""
         self.known = [*self.known, ("of one individual", INDIVIDUAL)]
-        names = self.found["individual"].values.tolist()
-        self.individual = dropdown("individual", OF, names, layout=WIDE)
+        names = self.result["individual"].values.tolist()
+        self.individual = dropdown("individual", TOOLTIP, names, layout=WIDE)
         _, *below = super().build(**options)
         self.redraw(self.paint, self.individual)
         return [row(self.map, self.individual), *below]
 
     def surface(self) -> xr.DataArray:
-        """The symmetric consensus, of which asymmetries are differences."""
-        return self.found["symmetric_position"]
+        """Return the symmetric consensus."""
+        return self.result["symmetric_position"]
 
     def values(self) -> tuple[np.ndarray, bool, str]:
-        """The map ``(n,)``, whether it has signs, and its unit."""
+        """Return the map ``(n,)``, whether it is signed, and its unit."""
         if self.map.value != INDIVIDUAL:
             return super().values()
-        own = self.found["asymmetry"].sel(individual=self.individual.value)
-        return (own.values * self.normals).sum(1), True, unit_of(own)
+        asymmetry = self.result["asymmetry"].sel(individual=self.individual.value)
+        return (asymmetry.values * self.normals).sum(1), True, unit_of(asymmetry)
 
     def paint(self) -> None:
-        """The map in colours, named after the individual where it is of one."""
+        """Colour the surface by the map, and name the individual in its title."""
         super().paint()
         if self.map.value == INDIVIDUAL:
             self.scene.title = f"asymmetry of {self.individual.value}"
 
     def summary(self, shown: np.ndarray) -> str:
-        """How much of the area is significant, p of the whole shape and of antisymmetry."""
-        p = self.found["antisymmetry_p"].item()
+        """Return the significant share of the area, and p of the shape and of antisymmetry."""
+        p = self.result["antisymmetry_p"].item()
         return f"{super().summary(shown)}; antisymmetry p = {p:.3g}"

@@ -1,17 +1,18 @@
 """Partial shape on a complete one (4.2, 6.1): alignment, match and missing region.
 
-Points of the part look for the nearest of the mean shape moved along its modes, in position and
-normal, never the other way: what is missing asks for nothing.  Rounds of rigid ICP from many starts
-come first (turns of a cube; centres of pieces as large as the part); of the best, each round solves
-for a small transform and the scores b that minimise
+Points of the partial shape search the nearest points, in position and normal, of the mean shape
+deformed by its modes.  The search has one direction, since missing vertices have no counterpart.
+Rigid ICP runs first from many initialisations: the rotations of a cube, about the centres of
+regions as large as the partial shape.  From the best results, each iteration solves for a small
+transform and the scores b that minimise
 
     sum_j a_j |z_j + sum_c b_c B_cj - p_j|^2_j + (r^2 / N) |b|^2,
 
-|.|_j mostly across the surface as in :mod:`s4a.method.elastic`, r the distance that is left and N
-as many points as count as independent.  Distances far above the median are left out, and points
-whose nearest one lies on the boundary of the whole.  A vertex of the whole is there where the point
-of the part that is nearest to it is near, looks the same way and is not on the part's own boundary.
-Elastic and local iterations of those vertices alone follow.
+where |.|_j mostly counts the distance across the surface, as in :mod:`s4a.method.elastic`, r is the
+residual and N the number of independent points.  Distances far above the median are left out, and
+points whose nearest point is on the boundary of the complete shape.  A vertex of the complete shape
+is present if the nearest point of the partial shape is close, has a similar normal and is not on
+the boundary of the partial shape.  Elastic and local iterations of the present vertices follow.
 """
 
 from dataclasses import replace
@@ -36,29 +37,29 @@ from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import Diffusion
 from s4a.schema import Array
 
-N_ROUGH = 150  # points of the part in the first iterations of ICP, and
+N_ROUGH = 150  # points of the partial shape in the first iterations of ICP
 N_ROUGH_ITERATIONS = 12
-N_POINTS = 1500  # in those with modes
+N_POINTS = 1500  # points in iterations with modes
 N_ITERATIONS = 40
-N_ANCHORS = 8  # places of the whole on which the part may begin
-N_STARTS = 16  # of ICP that go on
+N_ANCHORS = 8  # regions of the complete shape on which ICP begins
+N_INITIALISATIONS = 16  # ICP results that are refined
 N_INDEPENDENT = 100
-FAR = 3.0  # times the median distance: left out
+FAR = 3.0  # largest distance, relative to the median
 SLIDE = 0.1  # weight of the distance along the surface
-LEAST_GAP = 0.01  # share of sqrt(area): what is nearer is never left out
-PREFER = 0.9  # another turn than that of the study's shapes must leave less than this share
-LONGEST_TURN = 60.0  # degrees within which a pose counts as that of the study's shapes
+LEAST_DISTANCE = 0.01  # share of sqrt(area): smaller distances are never left out
+PREFER = 0.9  # a rotation unlike those of the study needs a residual below this share
+LARGEST_ANGLE = 60.0  # degrees within which a pose is like those of the study
 
 
 class Pose(NamedTuple):
-    """The transform s R x + t of a part into the frame of the template."""
+    """Transform s R x + t of a partial shape into the frame of the template."""
 
     R: Array
     t: Array
     s: float
 
     def __call__(self, X: Array) -> Array:
-        """Points ``(n, 3)`` moved."""
+        """Transform points ``(n, 3)``."""
         return self.s * X @ self.R.T + self.t
 
 
@@ -71,14 +72,14 @@ class Part(NamedTuple):
     area: Array
     boundary: Array  # (n,) of bool
 
-    def spread(self, n: int) -> Array:
-        """Vertices within, spread."""
+    def samples(self, n: int) -> Array:
+        """Return farthest-point samples of the interior vertices."""
         inner = np.flatnonzero(~self.boundary & (self.area > 0))
         return inner[farthest_points(self.X[inner], n)]
 
 
 class Whole(NamedTuple):
-    """The mean shape and its modes at low resolution, of unit area: ``X``, ``T``, ``modes``."""
+    """Mean shape and modes at low resolution, of unit area."""
 
     X: Array  # (n, 3)
     T: Array
@@ -87,10 +88,10 @@ class Whole(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Where a part came to lie: its pose, scores ``b`` of the whole, and how near.
+    """Fit of a partial shape: its pose and the scores ``b`` of the complete shape.
 
-    ``residual``: root mean square distance across the surface of what was not left out; ``inside``:
-    the share of the part's points of which it is.
+    ``residual``: root mean square distance across the surface of the points that were not left out;
+    ``inside``: their share.
     """
 
     pose: Pose
@@ -100,7 +101,7 @@ class Fit(NamedTuple):
 
 
 def on_boundary(T: Array, n: int) -> Array:
-    """Which of n vertices are on the boundary.
+    """Find the boundary vertices ``(n,)`` of a mesh.
 
     Examples
     --------
@@ -110,18 +111,18 @@ def on_boundary(T: Array, n: int) -> Array:
     np.False_
     """
     boundary = Basis(np.zeros((n, 3)), T, np.ones(n), np.zeros((n, 0))).boundary
-    found = np.zeros(n, bool)
-    found[np.unique(boundary)] = True
-    return found
+    result = np.zeros(n, bool)
+    result[np.unique(boundary)] = True
+    return result
 
 
 def part_of(X: Array, T: Array) -> Part:
-    """A part of its vertices and triangles."""
+    """Return a partial shape from its vertices and triangles."""
     return Part(X, T, vertex_normals(X, T), vertex_areas(X, T), on_boundary(T, len(X)))
 
 
-def cut(X: Array, T: Array, kept: Array) -> tuple[Array, Array]:
-    """The part of a surface whose vertices are kept.
+def cut(X: Array, T: Array, keep: Array) -> tuple[Array, Array]:
+    """Cut a surface to the triangles whose vertices are kept.
 
     Examples
     --------
@@ -131,50 +132,50 @@ def cut(X: Array, T: Array, kept: Array) -> tuple[Array, Array]:
     >>> cut(np.eye(4, 3), T, np.array([False, True, True, True]))[1].tolist()
     [[0, 2, 1]]
     """
-    T = T[kept[T].all(1)]
+    T = T[keep[T].all(1)]
     used = np.unique(T)
     number = np.full(len(X), -1)
     number[used] = np.arange(len(used))
     return X[used], number[T]
 
 
-def rough_starts(
-    part: Part, whole: Whole, first: Pose, *, turns: str = "O"
+def rough_poses(
+    part: Part, whole: Whole, usual: Pose, *, rotations: str = "O"
 ) -> list[tuple[float, Pose]]:
-    """Poses after ICP of some points of the partial shape, with residuals, the best first.
+    """Return poses by ICP of some points of the partial shape, with residuals, best first.
 
     Parameters
     ----------
     part : Part
     whole : Whole
-    first : Pose
-        How the shapes of the study lie in their files; turns and shifts are tried around it.
-    turns : {"O", "I"}
-        The 24 of a cube, or the 60 of an icosahedron.
+    usual : Pose
+        Mean pose of the shapes of the study; rotations and translations are relative to it.
+    rotations : {"O", "I"}
+        The 24 rotations of a cube, or the 60 of an icosahedron.
     """
-    P = first(part.X[part.spread(N_ROUGH)])
+    P = usual(part.X[part.samples(N_ROUGH)])
     center = P.mean(0)
     tree = cKDTree(whole.X)
-    anchors = _anchors(whole, first.s**2 * part.area.sum())
+    anchors = _anchors(whole, usual.s**2 * part.area.sum())
     shifts = [np.zeros(3), *(anchors - center)]
-    ends = []
-    for turn in Rotation.create_group(turns).as_matrix():
+    results = []
+    for rotation in Rotation.create_group(rotations).as_matrix():
         for shift in shifts:
-            R, t = turn, center + shift - turn @ center
+            R, t = rotation, center + shift - rotation @ center
             residual = np.inf
             for _ in range(N_ROUGH_ITERATIONS):
-                gap, nearest = tree.query(P @ R.T + t)
-                keep = gap <= np.quantile(gap, 0.9)
+                distance, nearest = tree.query(P @ R.T + t)
+                keep = distance <= np.quantile(distance, 0.9)
                 R, t, _ = rigid_transform(P[keep], whole.X[nearest[keep]])
-                before, residual = residual, float(np.sqrt((gap[keep] ** 2).mean()))
+                before, residual = residual, float(np.sqrt((distance[keep] ** 2).mean()))
                 if before - residual < 0.01 * residual:
                     break
-            ends.append((residual, Pose(R @ first.R, R @ first.t + t, first.s)))
-    return sorted(ends, key=lambda end: end[0])
+            results.append((residual, Pose(R @ usual.R, R @ usual.t + t, usual.s)))
+    return sorted(results, key=lambda result: result[0])
 
 
 def _anchors(whole, area):
-    """Centres ``(N_ANCHORS, 3)`` of pieces of the whole of that area, round samples."""
+    """Centres ``(N_ANCHORS, 3)`` of regions of the given area around samples."""
     weight = vertex_areas(whole.X, whole.T)
     centers = []
     for vertex in farthest_points(whole.X, N_ANCHORS):
@@ -184,16 +185,16 @@ def _anchors(whole, area):
     return np.array(centers)
 
 
-def different(
-    ends: list[tuple[float, Pose]], first: Pose, part: Part, most: int = N_STARTS
+def distinct(
+    results: list[tuple[float, Pose]], usual: Pose, part: Part, most: int = N_INITIALISATIONS
 ) -> list[Pose]:
-    """The best poses that differ, and the best of those near the first."""
-    points = part.X[part.spread(20)]
-    near = [end for end in ends if angle(end[1], first) < LONGEST_TURN]
+    """Return the best distinct poses, and the best of those near the usual one."""
+    points = part.X[part.samples(20)]
+    near = [result for result in results if angle(result[1], usual) < LARGEST_ANGLE]
     chosen: list[Pose] = []
-    for _, pose in [*near[:1], *ends]:
-        at = pose(points)
-        if all(np.linalg.norm(at - other(points), axis=1).mean() > 0.05 for other in chosen):
+    for _, pose in [*near[:1], *results]:
+        moved = pose(points)
+        if all(np.linalg.norm(moved - other(points), axis=1).mean() > 0.05 for other in chosen):
             chosen.append(pose)
         if len(chosen) == most:
             break
@@ -201,26 +202,27 @@ def different(
 
 
 def angle(pose: Pose, other: Pose) -> float:
-    """Degrees between two poses."""
-    turn = Rotation.from_matrix(pose.R @ other.R.T)
-    return float(np.degrees(turn.magnitude()))
+    """Return the angle between two poses in degrees."""
+    rotation = Rotation.from_matrix(pose.R @ other.R.T)
+    return float(np.degrees(rotation.magnitude()))
 
 
 def fit_modes(
     part: Part, whole: Whole, pose: Pose, *, iterations: int = N_ITERATIONS, free_size: bool = False
 ) -> Fit:
-    """Pose and scores of a part from a start, in iterations of nearest points of the whole.
+    """Fit pose and scores of a partial shape by iterated nearest points.
 
     Parameters
     ----------
     part, whole : see :class:`Part`, :class:`Whole`
     pose : Pose
+        Initial pose.
     iterations : int
     free_size : bool
-        Whether the size of the part is fitted, too.
+        Whether to fit the size as well.
     """
-    chosen = part.spread(N_POINTS)
-    P, N, weight = part.X[chosen], part.N[chosen], part.area[chosen]
+    sample = part.samples(N_POINTS)
+    P, N, weight = part.X[sample], part.N[sample], part.area[sample]
     star = stars(whole.T, len(whole.X))
     c = len(whole.modes)
     b = np.zeros(c)
@@ -249,73 +251,73 @@ def fit_modes(
     return Fit(pose, b, residual, inside)
 
 
-def _inliers(way, m, n, boundary, corners, share):
-    """Points that are near, look the same way, and are not nearest to the whole's boundary."""
-    gap = np.linalg.norm(way, axis=1)
+def _inliers(offset, m, n, boundary, corners, share):
+    """Find points that are close, have similar normals and are not nearest to the boundary."""
+    distance = np.linalg.norm(offset, axis=1)
     same = np.einsum("jx,jx->j", m, n) > 0.3
-    at_boundary = ((share > 1e-6) <= boundary[corners]).all(1)  # all corners that count are on it
+    at_boundary = ((share > 1e-6) <= boundary[corners]).all(1)  # all corners with weight are on it
     good = same & ~at_boundary
-    limit = max(FAR * float(np.median(gap[good])) if good.any() else 0.0, LEAST_GAP)
-    good &= gap <= limit
-    return good if good.sum() > 30 else gap <= np.quantile(gap, 0.9)
+    limit = max(FAR * float(np.median(distance[good])) if good.any() else 0.0, LEAST_DISTANCE)
+    good &= distance <= limit
+    return good if good.sum() > 30 else distance <= np.quantile(distance, 0.9)
 
 
 def _solve(pose, b, p, z, across, columns, weight, residual, free_size):
-    """One step of Gauss and Newton: small transform of the part, and new scores."""
+    """One Gauss-Newton step: small transform of the partial shape, and new scores."""
     c = len(b)
     center = weight @ p
     q = 7 if free_size else 6
     E = np.zeros((len(p), 3, c + q))
     E[:, :, :c] = columns
-    turns = np.cross(np.eye(3)[:, None], (p - center)[None])  # (3, j, 3)
-    E[:, :, c : c + 3] = -turns.transpose(1, 2, 0)
+    rotations = np.cross(np.eye(3)[:, None], (p - center)[None])  # (3, j, 3)
+    E[:, :, c : c + 3] = -rotations.transpose(1, 2, 0)
     E[:, :, c + 3 : c + 6] = -np.eye(3)
     if free_size:
         E[:, :, c + 6] = center - p
-    y = p - z + columns @ b  # what modes and transform are to make up for
+    y = p - z + columns @ b  # to be explained by modes and transform
     along = np.einsum("jx,jxq->jq", across, E)
     right = np.einsum("jx,jx->j", across, y)
     rows = (E * (SLIDE * weight)[:, None, None]).reshape(-1, c + q)
     H = rows.T @ E.reshape(-1, c + q) + (along * ((1 - SLIDE) * weight)[:, None]).T @ along
     g = rows.T @ y.ravel() + along.T @ ((1 - SLIDE) * weight * right)
-    price = max(residual, 1e-4) ** 2 / N_INDEPENDENT
-    H[np.diag_indices(c)] += price
+    penalty = max(residual, 1e-4) ** 2 / N_INDEPENDENT
+    H[np.diag_indices(c)] += penalty
     H[np.diag_indices(c + q)] += 1e-12
     x = np.linalg.solve(H, g)
     b = x[:c] * min(1.0, 3 * np.sqrt(c) / max(np.linalg.norm(x[:c]), 1e-12)) if c else x[:c]
-    turn = Rotation.from_rotvec(x[c : c + 3]).as_matrix()
+    R = Rotation.from_rotvec(x[c : c + 3]).as_matrix()
     grow = 1 + float(np.clip(x[c + 6], -0.1, 0.1)) if free_size else 1.0
-    shift = center + x[c + 3 : c + 6] - grow * turn @ center
-    return Pose(turn @ pose.R, grow * turn @ pose.t + shift, grow * pose.s), b
+    t = center + x[c + 3 : c + 6] - grow * R @ center
+    return Pose(R @ pose.R, grow * R @ pose.t + t, grow * pose.s), b
 
 
-def best_fit(part: Part, whole: Whole, starts: list[Pose], first: Pose, free_size: bool) -> Fit:
-    """The fit of the start that ends nearest; turned far from the first only where that is clear.
+def best_fit(part: Part, whole: Whole, poses: list[Pose], usual: Pose, free_size: bool) -> Fit:
+    """Return the best fit from several poses; a rotation far from the usual one must be clear.
 
-    What is compared is the distance left, over the share of the part that it is of.
+    Fits are compared by the residual divided by the share of the points that it includes.
     """
-    fits = [fit_modes(part, whole, start, iterations=15, free_size=free_size) for start in starts]
-    # all go on, from the mean shape again: after so few iterations the right one may be far behind
+    fits = [fit_modes(part, whole, pose, iterations=15, free_size=free_size) for pose in poses]
+    # continue all fits, from the mean shape: after few iterations the correct one may be behind
     fits = [fit_modes(part, whole, fit.pose, free_size=free_size) for fit in fits]
 
-    def registration_error(fit: Fit) -> float:
-        turned = angle(fit.pose, first) > LONGEST_TURN
-        worth = fit.residual / max(fit.inside, 0.05) * np.sqrt(1 + fit.b @ fit.b / N_INDEPENDENT)
-        return worth / PREFER if turned else worth
+    def score(fit: Fit) -> float:
+        rotated = angle(fit.pose, usual) > LARGEST_ANGLE
+        value = fit.residual / max(fit.inside, 0.05) * np.sqrt(1 + fit.b @ fit.b / N_INDEPENDENT)
+        return value / PREFER if rotated else value
 
-    return min(fits, key=registration_error)
+    return min(fits, key=score)
 
 
-def seen(X: Array, N: Array, part: Part, placed: Array, limit: float) -> Array:
-    """Which vertices of the whole the part has.
+def present_vertices(X: Array, N: Array, part: Part, placed: Array, limit: float) -> Array:
+    """Find the vertices ``(n,)`` of the complete shape that the partial shape has.
 
     Parameters
     ----------
     X, N : float ndarray (n, 3)
-        The whole's vertices and normals.
+        Vertices and normals of the complete shape.
     part : Part
     placed : float ndarray (p, 3)
-        Its vertices in the frame of the whole.
+        Vertices of the partial shape in the frame of the complete one.
     limit : float
         Largest distance.
     """
@@ -323,9 +325,9 @@ def seen(X: Array, N: Array, part: Part, placed: Array, limit: float) -> Array:
     corners = part.T[triangle]
     at_boundary = ((share > 1e-6) <= part.boundary[corners]).all(1)
     at_boundary &= (share > 1e-6).sum(1) < 3
-    gap = np.linalg.norm(X - interpolate(placed, part.T, triangle, share), axis=1)
+    distance = np.linalg.norm(X - interpolate(placed, part.T, triangle, share), axis=1)
     facing = np.einsum("nx,nx->n", N, triangle_normals(placed, part.T)[triangle]) > 0
-    return (gap <= limit) & facing & ~at_boundary
+    return (distance <= limit) & facing & ~at_boundary
 
 
 def refine(part: Part, placed: Array, target: Shape, X_low: Array, present: Array) -> Array:
@@ -335,11 +337,11 @@ def refine(part: Part, placed: Array, target: Shape, X_low: Array, present: Arra
     ----------
     part : Part
     placed : float ndarray (p, 3)
-        Its vertices in the frame of the template.
+        Vertices of the partial shape in the frame of the template.
     target : Shape
         The template.
     X_low : float ndarray (n, 3)
-        Its low resolution on the part, nearly.
+        Approximate positions of its coarse vertices on the partial shape.
     present : bool ndarray (n,)
     """
     area = vertex_areas(placed, part.T)

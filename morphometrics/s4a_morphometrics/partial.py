@@ -1,7 +1,7 @@
-"""What a study says of a part (6.1): its model at low resolution, the part's match, and the rest.
+"""Shape model of a study at low resolution, matched to a partial shape (6.1).
 
-How the part is found stands in :mod:`s4a_morphometrics.completion`, how sure the rest is in
-:mod:`s4a_morphometrics.calibration`.
+:mod:`s4a_morphometrics.completion` finds the pose of the partial shape,
+:mod:`s4a_morphometrics.calibration` calibrates the uncertainty of its completion.
 """
 
 from typing import NamedTuple
@@ -14,40 +14,40 @@ from s4a.method.pca import low_vertices
 from s4a.method.shape import Shape
 from s4a.options import Options
 from s4a_morphometrics import posterior
-from s4a_morphometrics.part import Fit, Part, Whole, on_boundary, refine, seen
+from s4a_morphometrics.part import Fit, Part, Whole, on_boundary, present_vertices, refine
 
-LEAST_SHARE = 0.15  # of the template that a part must have
-N_ITERATIONS = 2  # of finding what is there, and of matching it
+LEAST_SHARE = 0.15  # smallest share of the template in a partial shape
+N_ITERATIONS = 2  # of detecting present vertices and matching them
 
 
 class Model(NamedTuple):
-    """A study at the low resolution of its template, lengths for unit area."""
+    """Shape model of a study at the low resolution of its template, of unit area."""
 
     study: xr.DataTree
     template: Shape
-    at: np.ndarray  # (n_low,), original vertices
+    at: np.ndarray  # (n_low,), original vertices of the coarse ones
     X: np.ndarray  # (n_low, 3), of the template
     fields: np.ndarray  # (s, n_low, 3), displacements
-    modes: np.ndarray  # (c, s), each as weights of the fields
-    area: np.ndarray  # (n_low,), of sum 1
+    modes: np.ndarray  # (c, s), weights of the fields in each mode
+    area: np.ndarray  # (n_low,), sums to 1
     scale: bool
     mean_full: np.ndarray  # (n, 3), mean displacement at full resolution
     modes_full: np.ndarray  # (c, n, 3)
 
 
 def model_of(study: xr.DataTree) -> Model:
-    """What completion needs of a study; ValueError where it has it not."""
+    """Return the shape model of a study; raise ValueError if the study lacks a part of it."""
     needed = "original", "coarse", "latent", "registration", "pca"
     missing = [name for name in needed if name not in study.children]
     if missing:
         raise ValueError(f"a finished study is needed; this one lacks {', '.join(missing)}")
     options = Options.from_report(study)
     if options.method == "scalable":
-        raise ValueError("parts need a study with a coarse mesh; method='scalable' has none")
+        raise ValueError("partial shapes need a coarse mesh; method='scalable' has none")
     registration = registration_of(study)
     if registration.sizes["shape"] < 4:
         raise ValueError(
-            f"parts need a study of at least 4 shapes, found {registration.sizes['shape']}"
+            f"partial shapes need a study of at least 4 shapes; found {registration.sizes['shape']}"
         )
     name = registration.attrs["template"]
     template = Shape(
@@ -75,7 +75,7 @@ def model_of(study: xr.DataTree) -> Model:
 
 
 def whole_of(model: Model) -> Whole:
-    """The mean shape and the modes of a study at low resolution."""
+    """Return the mean shape and the modes of a study at low resolution."""
     mean = model.fields.mean(0)
     modes = np.einsum("cs,snx->cnx", model.modes, model.fields - mean)
     T = model.template.low.T
@@ -83,12 +83,12 @@ def whole_of(model: Model) -> Whole:
 
 
 def match(part: Part, model: Model, whole: Whole, fit: Fit) -> tuple[np.ndarray, np.ndarray, Fit]:
-    """The template's low resolution on the part, and which of its vertices are there.
+    """Match the coarse template to a partial shape, and find the vertices that are present.
 
     Returns
     -------
     low : float ndarray (n_low, 3)
-        In the frame of the template, as the part is placed by the fit.
+        In the frame of the template, after the pose of the fit.
     present : bool ndarray (n_low,)
     fit : Fit
     """
@@ -97,39 +97,40 @@ def match(part: Part, model: Model, whole: Whole, fit: Fit) -> tuple[np.ndarray,
     limit = max(0.02, 3 * fit.residual)
     for _ in range(N_ITERATIONS):
         normals = model.template.low_on_surface.normals_at(low)
-        present = seen(low, normals, part, placed, limit)
+        present = present_vertices(low, normals, part, placed, limit)
         if model.area @ present < LEAST_SHARE:
             return low, present, fit
         low = refine(part, placed, model.template, low, present)
     normals = model.template.low_on_surface.normals_at(low)
-    return low, present & seen(low, normals, part, placed, limit), fit
+    return low, present & present_vertices(low, normals, part, placed, limit), fit
 
 
-class Told(NamedTuple):
-    """What is reported of a shape at low resolution, in the frame of the template.
+class Completion(NamedTuple):
+    """Posterior distribution of a shape at low resolution, in the frame of the template.
 
-    ``weights`` of the ``columns (p, n_low, 3)``, ``spread (r, n_low, 3)``, the fields that they may
-    differ by, independent and of one standard deviation each, and ``image (n_low, 3)``, which goes
-    through the matches where there are any.
+    ``weights`` of the ``columns (p, n_low, 3)``; ``deviation (r, n_low, 3)``, independent fields of
+    one standard deviation each; and the mean ``image (n_low, 3)``, which interpolates the matches.
     """
 
     weights: posterior.Posterior
     columns: np.ndarray
-    spread: np.ndarray
+    deviation: np.ndarray
     image: np.ndarray
 
 
-def tell(model: Model, known: posterior.Known, low: np.ndarray, density: float) -> Told:
-    """The distribution of a shape whose vertices `low` ``(n_low, 3)`` are known where present."""
+def complete_low(
+    model: Model, known: posterior.Known, low: np.ndarray, density: float
+) -> Completion:
+    """Return the posterior of a shape, given its present vertices in `low` ``(n_low, 3)``."""
     target, present = model.template, known.present
     mean = model.X + model.fields.mean(0)
     weights = posterior.weights_of(known, model.modes)
     y = (low - mean)[present]
     inner = np.einsum("qnx,nx,n->q", known.columns[:, present], y, model.area[present])
-    found = posterior.condition(known, weights, inner, density)
+    posterior_weights = posterior.condition(known, weights, inner, density)
     columns = np.einsum("qp,qnx->pnx", weights, known.columns, optimize=True)
-    spread = np.einsum("pr,pnx->rnx", found.root, columns, optimize=True)
-    told = mean + np.tensordot(found.mean, columns, 1)
+    deviation = np.einsum("pr,pnx->rnx", posterior_weights.root, columns, optimize=True)
+    expected = mean + np.tensordot(posterior_weights.mean, columns, 1)
     kappa2 = float(target.low.eigenvalue[-1])
-    left = posterior.extend(low - told, present, target.W, model.area, kappa2)
-    return Told(found, columns, spread, told + left)
+    residual = posterior.extend(low - expected, present, target.W, model.area, kappa2)
+    return Completion(posterior_weights, columns, deviation, expected + residual)

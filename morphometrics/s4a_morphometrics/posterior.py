@@ -1,18 +1,17 @@
-"""Posterior shape model (6.1): what the modes say of a whole of which a part is known.
+"""Posterior shape model (6.1): distribution of a shape of which a part is known.
 
-A shape is the mean, the modes with normal scores, and what no mode of so few shapes holds: a smooth
-field of the template's first functions, whose variances are those of the errors with which each
-shape is described by all others.  All of it is normal, so that the shapes that agree with a part
-are normal again (Albrecht, Luethi, Gerig and Vetter, Medical Image Analysis 2013; the smooth field
-in addition to the modes is that of Luethi, Gerig, Jud and Vetter, TPAMI 2018).  With E the columns
-of modes, functions and small transforms, y what is known at some vertices less the mean there,
+A shape is the mean, plus modes with normal scores, plus a smooth field of the template's first
+eigenfunctions for variation that the modes of few shapes lack.  The variances of the smooth field
+are those of the errors of each shape when all others describe it.  All terms are normal, so the
+posterior given a partial shape is normal, too (Albrecht, Luethi, Gerig and Vetter, Medical Image
+Analysis 2013; modes with a smooth field: Luethi, Gerig, Jud and Vetter, TPAMI 2018).  With columns
+E of modes, eigenfunctions and small transforms, and y the known vertices minus their mean,
 
     H = E^T W E + P,   w = H^-1 E^T W y,   cov(w) = H^-1,
 
-W the weights of these vertices by their areas, P the inverse of the variances before, and 0 of
-transforms: how a part lies is not known either.  The same is asked of every shape of the study by
-the model of the others, with the same part known: how many places of a part count as independent is
-what makes these errors least.
+where W weights the known vertices by area and P is the prior precision, 0 for transforms, as the
+pose is unknown.  The number of independent points is chosen by leave-one-out: it minimises the
+errors of the study's shapes when the others complete them from the same part.
 """
 
 from collections.abc import Callable
@@ -25,18 +24,18 @@ import scipy.sparse as sp
 from s4a.method.spectral import factor
 from s4a.schema import Array
 
-DENSITY = (0.25, 1.0, 4.0, 16.0)  # independent places known on all of the template, by functions
+DENSITY = (0.25, 1.0, 4.0, 16.0)  # independent points on the whole template, per eigenfunction
 WITHIN_90 = 1.6449  # standard deviations
-N_TESTED = 400  # vertices at which the errors of left-out shapes are looked at
+N_TESTED = 400  # vertices at which errors of left-out shapes are computed
 
 
 class Known(NamedTuple):
-    """What is known of a shape, and of which kind shapes are.
+    """Prior of the shapes, and the known vertices of one shape.
 
-    ``columns (q, n, 3)``: the s fields of the study less their mean, 3 K smooth fields, transforms;
-    ``n_fields``, ``n_smooth``, how many of the former; ``area (n,)`` of sum 1; ``present (n,)``,
-    the vertices that are known; ``gram (q, q)`` of the columns there; ``variance (3 K,)`` of the
-    smooth fields; ``rest``, the variance of every coordinate that none of them holds.
+    ``columns (q, n, 3)``: the s centred fields of the study, 3 K smooth fields, transforms;
+    ``n_fields`` and ``n_smooth``, their numbers; ``area (n,)``, sums to 1; ``present (n,)``, the
+    known vertices; ``gram (q, q)`` of the columns there; ``variance (3 K,)`` of the smooth fields;
+    ``rest``, the variance of each coordinate that no column explains.
     """
 
     columns: Array
@@ -57,15 +56,15 @@ class Posterior(NamedTuple):
 
 
 def residual_weights(K: Array) -> Array:
-    """Row i: weights ``(s,)`` of all fields that give field i less its best description by others.
+    """Return weights of all fields that give the residual of each field from the others.
 
-    The nearest field of the affine hull of the others: with the pseudo-inverse P of the centred
-    Gram matrix, P_ij / P_ii.
+    Row i gives field i minus the nearest field in the affine hull of the others: with the
+    pseudo-inverse P of the centred Gram matrix, P_ij / P_ii.
 
     Parameters
     ----------
     K : float ndarray (s, s)
-        Gram matrix of the fields less their mean.
+        Gram matrix of the centred fields.
 
     Examples
     --------
@@ -80,7 +79,7 @@ def residual_weights(K: Array) -> Array:
 
 
 def smooth_variance(coefficient: Array) -> Array:
-    """Variance ``(K,)`` of coefficients ``(s, K, 3)``, a mean over functions of like frequency."""
+    """Return variances ``(K,)`` of coefficients ``(s, K, 3)``, smoothed over the frequency."""
     variance = (coefficient**2).mean((0, 2))  # (K,)
     total = np.concatenate([[0], np.cumsum(variance)])
     k = np.arange(len(variance))
@@ -89,7 +88,7 @@ def smooth_variance(coefficient: Array) -> Array:
 
 
 def transforms(X: Array, center: Array, *, scale: bool = False) -> Array:
-    """Small transforms ``(6 or 7, n, 3)`` of points X ``(n, 3)``: turns, shifts, growth.
+    """Return infinitesimal rotations, translations and scaling of points: ``(6 or 7, n, 3)``.
 
     Examples
     --------
@@ -99,34 +98,34 @@ def transforms(X: Array, center: Array, *, scale: bool = False) -> Array:
     [[0.0, 1.0, 0.0]]
     """
     axes = np.eye(3)
-    turns = [np.cross(axis, X - center) for axis in axes]
-    shifts = [np.broadcast_to(axis, X.shape) for axis in axes]
-    return np.stack([*turns, *shifts, *[X - center] * scale])
+    rotations = [np.cross(axis, X - center) for axis in axes]
+    translations = [np.broadcast_to(axis, X.shape) for axis in axes]
+    return np.stack([*rotations, *translations, *[X - center] * scale])
 
 
 def know(
     fields: Array, Phi: Array, X: Array, area: Array, present: Array, *, scale: bool = False
 ) -> Known:
-    """What a study says of shapes of which some vertices are known.
+    """Return the prior of a study for shapes with some known vertices.
 
     Parameters
     ----------
     fields : float ndarray (s, n, 3)
         Displacements of the study.
     Phi : float ndarray (n, K)
-        Functions, orthonormal in the areas.
+        Eigenfunctions, orthonormal in the areas.
     X : float ndarray (n, 3)
         Vertices of the template.
     area : float ndarray (n,)
-        Of sum 1.
+        Sums to 1.
     present : bool ndarray (n,)
     scale : bool
-        Whether the size of a shape says nothing either.
+        Whether size is unknown, too.
     """
     s, n, _ = fields.shape
-    around = fields - fields.mean(0)
-    weighted = around * area[:, None]
-    K = np.einsum("snx,tnx->st", around, weighted, optimize=True)
+    centred = fields - fields.mean(0)
+    weighted = centred * area[:, None]
+    K = np.einsum("snx,tnx->st", centred, weighted, optimize=True)
     weights = residual_weights(K)
     coefficient = np.einsum("st,tnx,nk->skx", weights, weighted, Phi, optimize=True)
     length = np.einsum("ij,jk,ik->i", weights, K, weights)  # squared
@@ -136,22 +135,22 @@ def know(
     for x in range(3):
         each[:, x, :, x] = Phi.T
     smooth = each.reshape(-1, n, 3)
-    columns = np.concatenate([around, smooth, transforms(X, area @ X, scale=scale)])
+    columns = np.concatenate([centred, smooth, transforms(X, area @ X, scale=scale)])
     rows = (columns[:, present] * np.sqrt(area[present])[:, None]).reshape(len(columns), -1)
     rest = max(float(left.mean()) / 3, 1e-6 * float(np.trace(K)) / s)
-    # of nothing: a number that inverts
+    # a lower bound, so that the variances can be inverted
     variance = np.maximum(np.repeat(variance, 3), 1e-9 * variance.max() + 1e-15)
     return Known(columns, s, len(smooth), area, present, rows @ rows.T, variance, rest)
 
 
 def weights_of(known: Known, modes: Array) -> Array:
-    """Weights of all columns ``(q, p)`` that give modes, functions and transforms.
+    """Return weights of the columns ``(q, p)`` for modes, eigenfunctions and transforms.
 
     Parameters
     ----------
     known : Known
     modes : float ndarray (c, s)
-        Of one standard deviation each, as weights of the fields.
+        Modes of one standard deviation, as weights of the fields.
     """
     q, c = len(known.columns), len(modes)
     weights = np.zeros((q, c + q - known.n_fields))
@@ -161,7 +160,7 @@ def weights_of(known: Known, modes: Array) -> Array:
 
 
 def modes_of(K: Array, used: Array) -> Array:
-    """Modes of some fields, of one standard deviation each, as weights of all ``(c, s)``.
+    """Return modes of some fields, of one standard deviation, as weights of all ``(c, s)``.
 
     Parameters
     ----------
@@ -178,7 +177,7 @@ def modes_of(K: Array, used: Array) -> Array:
 
 
 def precision(known: Known, model: Array, density: float) -> tuple[Array, float]:
-    """Matrix H of the module's equation, and the weight of the area in W."""
+    """Return the matrix H of the equation above, and the weight of the area in W."""
     c = model.shape[1] - (len(known.columns) - known.n_fields)
     weight = density * known.n_smooth / 3 / known.rest
     H = weight * (model.T @ known.gram @ model)
@@ -190,63 +189,61 @@ def precision(known: Known, model: Array, density: float) -> tuple[Array, float]
     return H, weight
 
 
-def condition(known: Known, model: Array, seen: Array, density: float) -> Posterior:
-    """Weights of the model's columns when the part is known.
+def condition(known: Known, model: Array, observed: Array, density: float) -> Posterior:
+    """Return the posterior weights of the columns of the model.
 
     Parameters
     ----------
     known : Known
     model : float ndarray (q, p)
-        Of :func:`weights_of`.
-    seen : float ndarray (q,)
-        Inner products of the columns with what is known less the mean, over the part.
+        From :func:`weights_of`.
+    observed : float ndarray (q,)
+        Inner products of the columns with the known vertices minus their mean.
     density : float
         See :data:`DENSITY`.
     """
     H, weight = precision(known, model, density)
     L = scipy.linalg.cholesky(H, lower=True, check_finite=False)
     root = scipy.linalg.solve_triangular(L, np.eye(len(H)), lower=True, check_finite=False).T
-    return Posterior(root @ (root.T @ (weight * (model.T @ seen))), root)
+    return Posterior(root @ (root.T @ (weight * (model.T @ observed))), root)
 
 
 def left_out(known: Known, density: float, tested: Array) -> Array:
-    """Errors ``(s, t, 3)`` of every shape, told from its part by the others, at tested vertices."""
+    """Return leave-one-out errors ``(s, t, 3)`` of every shape at tested vertices."""
     s, q = known.n_fields, len(known.columns)
     rows = known.columns[:, tested].reshape(q, -1)  # (q, 3 t)
     fields = known.columns[:s]
     K = np.einsum("snx,tnx,n->st", fields, fields, known.area, optimize=True)
-    error = []
+    errors = []
     for i in range(s):
         used = np.delete(np.arange(s), i)
         model = weights_of(known, modes_of(K, used))
-        own = np.zeros(q)
-        own[i] = 1
-        own[used] = -1 / (s - 1)
-        found = condition(known, model, known.gram @ own, density)
-        error.append((own - model @ found.mean) @ rows)
-    return np.reshape(error, (s, len(tested), 3))
+        weights = np.zeros(q)  # of shape i minus the mean of the others
+        weights[i] = 1
+        weights[used] = -1 / (s - 1)
+        estimate = condition(known, model, known.gram @ weights, density)
+        errors.append((weights - model @ estimate.mean) @ rows)
+    return np.reshape(errors, (s, len(tested), 3))
 
 
 def best_density(known: Known, where: Array) -> tuple[float, float]:
-    """How many places of the part count as independent, and the error of shapes left out.
-
-    That of :data:`DENSITY` with the least root mean square error of a coordinate.
+    """Return the best value of :data:`DENSITY` and its leave-one-out error of a coordinate.
 
     Parameters
     ----------
     known : Known
     where : bool ndarray (n,)
-        Vertices at which the errors are looked at: those that are missing.
+        Vertices at which errors are computed, usually the missing ones.
     """
     rows = np.flatnonzero(where)
     tested = rows[:: max(1, len(rows) // N_TESTED)]
-    sizes = [float(np.sqrt((left_out(known, one, tested) ** 2).mean())) for one in DENSITY]
+    sizes = [float(np.sqrt((left_out(known, density, tested) ** 2).mean())) for density in DENSITY]
     least = int(np.argmin(sizes))
     return DENSITY[least], sizes[least]
 
 
 def extend(values: Array, known: Array, W: sp.csr_matrix, area: Array, kappa2: float) -> Array:
-    """Values ``(n, 3)`` of the known vertices, fading to 0 on the others: (W + kappa^2 A) u = 0.
+    """Extend values ``(n, 3)`` of known vertices, decaying to 0: (W + kappa^2 A) u = 0.
 
     Parameters
     ----------
@@ -256,7 +253,7 @@ def extend(values: Array, known: Array, W: sp.csr_matrix, area: Array, kappa2: f
         Stiffness matrix.
     area : float ndarray (n,)
     kappa2 : float
-        They fade over 1 / kappa.
+        The values decay over a length of 1 / kappa.
     """
     u = np.where(known[:, None], values, 0.0)
     free = np.flatnonzero(~known)
@@ -269,10 +266,10 @@ def extend(values: Array, known: Array, W: sp.csr_matrix, area: Array, kappa2: f
 def rough_fields(
     W: sp.csr_matrix, area: Array, kappa2: float
 ) -> Callable[[np.random.Generator], Array]:
-    """Draws random fields ``(n, 3)`` of variance about 1, alike over 1 / kappa.
+    """Return a function that draws random fields ``(n, 3)`` of variance about 1.
 
-    (W + kappa^2 A) u = A^(1/2) g with g white, of variance 1 / (4 pi kappa^2) on a plane (Lindgren,
-    Rue and Lindstroem 2011).
+    (W + kappa^2 A) u = A^(1/2) g with white noise g has the correlation length 1 / kappa and on a
+    plane the variance 1 / (4 pi kappa^2) (Lindgren, Rue and Lindstroem 2011).
     """
     solve = factor(W + kappa2 * sp.diags_array(area))
     size = np.sqrt(4 * np.pi * kappa2)

@@ -1,4 +1,4 @@
-"""A region of the template (6.1), drawn around on its surface, for statistics within it."""
+"""A region of the template (6.1), selected on its surface, for statistics within it."""
 
 import ipywidgets
 import numpy as np
@@ -9,38 +9,42 @@ from s4a.show.surfaces import label_text
 from s4a.widgets.panel import WIDE, Panel, dropdown, row
 from s4a.widgets.views import MARK
 
-ADD, REMOVE = "add", "take away"
-LASSO = "while it is pressed a drag draws around vertices, and does not turn the surface"
-HOW = "what happens to the vertices that are drawn around, of those that are seen"
+ADD, REMOVE = "add", "remove"
+LASSO = "select vertices by dragging around them, instead of rotating the surface"
+ACTION = "add the visible vertices inside the lasso to the region, or remove them"
 NO_LABEL = ()  # the value of "none" in the list, which cannot hold None
-LABEL = "the region of a label of the template, to begin with"
+LABEL = "replace the region by a label of the template"
 
 
 class Region(Panel):
-    """A region of the template: draw around vertices, or take a label.
+    """A region of the template, selected with a lasso or by a label.
 
     Parameters
     ----------
     study : xarray.DataTree
         With a registration.
     view, up
-        From where the surface is seen first; see :func:`s4a.show.draw.rotation`.
+        Initial direction of view; see :func:`s4a.show.draw.rotation`.
 
     Attributes
     ----------
     region : bool ndarray (vertex,)
-        The chosen vertices of the template, as :func:`s4a_morphometrics.within` takes them.
+        Mask of the selected vertices of the template, for :func:`s4a_morphometrics.within`.
+
+    See Also
+    --------
+    s4a_morphometrics.within : a study restricted to a region.
 
     Examples
     --------
-    With the ``study`` of six small brains; the square is what a drag draws:
+    With a study of six small brains; the square is a lasso selection:
 
     >>> import s4a
     >>> from s4a_morphometrics import Region, within
     >>> study = s4a.synthetic.example_study()
     >>> panel = Region(study, view="top")
     >>> square = [[0, -99], [99, -99], [99, 99], [0, 99]]
-    >>> panel.scene.drawn_around = {"polygon": square, "turn": panel.scene.turn, "count": 1}
+    >>> panel.scene.drawn_around = {"polygon": square, "rotation": panel.scene.rotation, "count": 1}
     >>> right = within(study, panel.region)
     >>> bool(right["registration"]["position"].values[:, 0].min() >= 0)
     True
@@ -52,15 +56,15 @@ class Region(Panel):
     python = ("drawing a region",)
 
     def build(self) -> list[ipywidgets.Widget]:
-        """The surface, and what a drag does."""
+        """Return the controls and the view of the surface."""
         template = self.study["registration"].dataset
         self.X, self.T = template["position"].values, template["corner_vertex"].values
         self.area = vertex_areas(self.X, self.T)
-        self.how, own = dropdown("drawn", HOW, [ADD, REMOVE]), {"layout": {"width": "auto"}}
-        self.lasso = ipywidgets.ToggleButton(description="lasso", tooltip=LASSO, **own)
-        self.none = self.button("nothing", self.clear, "choose no vertex", **own)
-        self.others = self.button("others", self.invert, "choose all other vertices", **own)
-        controls = [self.lasso, self.how, self.none, self.others]
+        self.action, auto = dropdown("action", ACTION, [ADD, REMOVE]), {"layout": {"width": "auto"}}
+        self.lasso = ipywidgets.ToggleButton(description="lasso", tooltip=LASSO, **auto)
+        self.none = self.button("clear", self.clear, "select no vertex", **auto)
+        self.others = self.button("invert", self.invert, "select all other vertices", **auto)
+        controls = [self.lasso, self.action, self.none, self.others]
         self.label = self._labels(template.attrs["template"])
         if self.label is not None:
             controls.insert(0, self.label)
@@ -74,41 +78,40 @@ class Region(Panel):
         return [row(*controls), self.scene]
 
     def _labels(self, name):
-        """A list of the template's labels; None where it has none."""
+        """Return a list of the template's labels; None if it has none."""
         mesh = self.study["original"].get(name)
         if mesh is None or "label" not in mesh:
             return None
         self.labels = mesh["label"].values
-        labels = [(label_text(mesh, one), one) for one in np.unique(self.labels).tolist()]
+        labels = [(label_text(mesh, label), label) for label in np.unique(self.labels).tolist()]
         options = [("none", NO_LABEL), *labels]
         return dropdown("label", LABEL, options, value=NO_LABEL, layout=WIDE)
 
     def take_label(self, label: object) -> None:
-        """The vertices of a label that was chosen from the list."""
+        """Select the vertices of a label."""
         if label != NO_LABEL:
-            self.take(self.labels == label)
+            self.set_region(self.labels == label)
 
     def take_drawn(self, drawn: dict) -> None:
-        """The vertices that were drawn around are added, or taken away."""
-        within = vertices_within(self.X, self.T, drawn["polygon"], drawn["turn"])
+        """Add or remove the vertices inside the lasso."""
+        within = vertices_within(self.X, self.T, drawn["polygon"], drawn["rotation"])
         if not within.any():
-            self.say("no vertex is seen within what was drawn")
+            self.show_message("no visible vertex is inside the lasso; draw around some vertices")
             return
-        self.say("")
-        self.take(
-            self.region | within if self.how.value == ADD else self.region & ~within, NO_LABEL
-        )
+        self.show_message("")
+        added = self.action.value == ADD
+        self.set_region(self.region | within if added else self.region & ~within, NO_LABEL)
 
     def clear(self) -> None:
-        """Choose no vertex."""
-        self.take(np.zeros(len(self.X), bool), NO_LABEL)
+        """Select no vertex."""
+        self.set_region(np.zeros(len(self.X), bool), NO_LABEL)
 
     def invert(self) -> None:
-        """Choose all other vertices."""
-        self.take(~self.region, NO_LABEL)
+        """Select all other vertices."""
+        self.set_region(~self.region, NO_LABEL)
 
-    def take(self, region: np.ndarray, label: object = None) -> None:
-        """Make these vertices ``(n,)`` the region, and show it; `label` where it is of none."""
+    def set_region(self, region: np.ndarray, label: object = None) -> None:
+        """Set and show the region, a mask ``(n,)``; `label` is NO_LABEL if it is not a label's."""
         if self.label is not None and label is not None:
             self.label.value = label
         self.region = region

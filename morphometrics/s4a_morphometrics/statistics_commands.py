@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def fields(
     study: str, folder: str, *, name: str, unit: str | None = None, partial: bool = False
 ) -> int:
-    """A number per vertex of every shape, such as thickness, transferred to the template and kept.
+    """Transfer a scalar field of every shape, such as thickness, to the template.
 
     Parameters
     ----------
@@ -74,16 +74,16 @@ def field_statistics(
     regress_on : COLUMN
         regression of the field on a number, such as age
     covariates : COLUMN
-        accounted for in both
-    table : FILE
-        in place of the table of the study
+        covariates of both
+    table : PATH
+        CSV with a column 'shape', in place of the table of the study
     variances
-        of the fields around what is tested; unequal where groups scatter differently
+        of the fields around what is tested; unequal if groups have different covariance
     include_flagged
-        take flagged shapes in
+        include flagged shapes
     permutations : N
         of every test (default: 9999, at every vertex 999, of classes 99)
-    out : DIR
+    out : FOLDER
         for netCDF and CSV (default: STUDY/statistics)
     """
     import s4a_morphometrics as m
@@ -114,7 +114,7 @@ def field_statistics(
 def region_statistics(
     study: str,
     *,
-    label: list[int | str] | None = None,
+    region: list[int | str] | None = None,
     labels: str | None = None,
     min_confidence: float = 0.0,
     regress_out: list[str] | None = None,
@@ -135,10 +135,11 @@ def region_statistics(
     ----------
     study : STUDY
         its folder
-    label : LABEL
+    region : LABEL
         only vertices of the template with these labels
     labels : FILE
-        labels of the template's file for --label: NPY, NPZ (FILE:NAME), CSV, GIFTI or annot
+        labels of the template's vertices (default: its own): NPY, NPZ (FILE:NAME), CSV, GIFTI or
+        annot
     min_confidence : SHARE
         only vertices whose mean confidence is this large, 0 to 1
     regress_out : COLUMN
@@ -150,24 +151,24 @@ def region_statistics(
     regress_on : COLUMN
         regression of shape on a number, such as age; its animation
     covariates : COLUMN
-        accounted for in both
-    table : FILE
-        in place of the table of the study
+        covariates of both
+    table : PATH
+        CSV with a column 'shape', in place of the table of the study
     variances
-        of the shapes around what is tested; unequal where groups scatter differently
+        of the shapes around what is tested; unequal if groups have different covariance
     include_flagged
-        take flagged shapes in
+        include flagged shapes
     permutations : N
         of every test (default: 9999, at every vertex 999, of classes 99)
-    out : DIR
+    out : FOLDER
         for netCDF and CSV (default: STUDY/statistics)
     """
     if covariates and not (group or regress_on):
-        raise ValueError("--covariates are of a test: give --group or --regress-on")
-    if labels and not label:
-        raise ValueError("--labels needs --label LABEL...: give both, or leave it out")
+        raise ValueError("--covariates needs a test: give --group or --regress-on")
+    if labels and not region:
+        raise ValueError("--labels needs --region LABEL...: give both, or leave it out")
     tree, out = study_to_test(study, out, table, include_flagged)
-    tree = restricted(tree, restore_size, regress_out, label, labels, min_confidence)
+    tree = restricted(tree, restore_size, regress_out, region, labels, min_confidence)
     options = {"covariates": covariates, "seed": seed, "variances": variances}
     write_statistics(tree, out, group, regress_on, permutations, options)
     return 0
@@ -177,7 +178,7 @@ def restricted(
     study: "xr.DataTree",
     restore_size: bool,
     regress_out: list[str] | None,
-    label: list[int | str] | None,
+    region: list[int | str] | None,
     labels: str | None,
     min_confidence: float,
 ) -> "xr.DataTree":
@@ -191,10 +192,10 @@ def restricted(
     if regress_out:
         study = m.without(study, regress_out)
         said.append(f"without {', '.join(regress_out)}")
-    if label or min_confidence:
+    if region or min_confidence:
         whole = study["registration"].sizes["vertex"]
         of = template_labels(study, labels)
-        study = m.within(study, label, labels=of, min_confidence=min_confidence)
+        study = m.within(study, region, labels=of, min_confidence=min_confidence)
         said.append(f"{study['registration'].sizes['vertex']} of {whole} vertices")
     if said:
         write("; ".join(said) + "\n")
@@ -217,15 +218,15 @@ def generalization(
     n_jobs: int,
     seed: int,
 ) -> int:
-    """Generalization of the modes, with the correspondences of each left-out shape found again.
+    """Compute the generalization of the modes with correspondences found again (slow).
 
     Parameters
     ----------
     study : STUDY
         its folder
     include_flagged
-        take flagged shapes in
-    out : DIR
+        include flagged shapes
+    out : FOLDER
         for netCDF and CSV (default: STUDY/statistics)
     """
     import s4a_morphometrics as m

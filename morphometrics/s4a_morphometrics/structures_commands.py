@@ -1,4 +1,4 @@
-"""The commands of several structures: their flags, what they do, and what they print."""
+"""The commands of several structures: flags, actions and output."""
 
 from argparse import ArgumentTypeError, Namespace
 from collections.abc import Callable
@@ -15,7 +15,7 @@ TABLE = "CSV with columns shape, subject and structure"
 
 
 def run(args: Namespace) -> int:
-    """The analysis of every structure of each subject: files and a table, or label volumes."""
+    """Analyse every structure of each subject: files and a table, or label volumes."""
     from s4a.cli.tables import run_summary
     from s4a_morphometrics.several import analyse_structures
 
@@ -32,7 +32,7 @@ def run(args: Namespace) -> int:
 
 
 def insert(args: Namespace) -> int:
-    """New subjects in the studies of several structures, which stay as they are."""
+    """Register new subjects to the studies of several structures, which stay unchanged."""
     from s4a.analysis.export import write_registered
     from s4a.cli.tables import inserted_table
     from s4a.study.tree import write_inserted
@@ -51,7 +51,7 @@ def insert(args: Namespace) -> int:
 
 
 def compare(args: Namespace) -> int:
-    """How structures vary in how they lie relative to each other, and each in its shape."""
+    """Analyse the variation of structures in relative pose and in shape."""
     from s4a.analysis.effects import group_test
     from s4a.analysis.export import write_results, write_scores
     from s4a.show.page import write_page
@@ -124,8 +124,8 @@ def _insert(add: Callable[..., Any]) -> None:
 
 def _compare(add: Callable[..., Any]) -> None:
     add("study", metavar="STUDY")
-    add("--scale", action="store_true", help="take the size of each whole subject out")
-    text = "also test whether groups differ in how structures lie, and in their shapes"
+    add("--scale", action="store_true", help="remove the size of each whole subject")
+    text = "also test groups for differences in relative pose and in shape"
     add("--group", metavar="COLUMN", help=text)
     text = "folder of s4a insert-structures, or its inserted.nc: poses and scores of new subjects"
     add("--new", metavar="DIR", help=text)

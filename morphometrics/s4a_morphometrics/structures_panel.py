@@ -10,7 +10,7 @@ from s4a.schema import unit_of
 from s4a.show.browser import color_bytes
 from s4a.show.surfaces import mode_arrays, mode_limits, score_state
 from s4a.widgets.modes import ModesView
-from s4a.widgets.panel import Panel, check, dropdown, row, together
+from s4a.widgets.panel import Panel, checkbox, dropdown, row, unbroken_row
 from s4a_morphometrics.poses import LEVELS, structures, structures_modes
 
 WORDS = {
@@ -62,7 +62,7 @@ class Structures(Panel):
         variance = self.found["level_variance"].sum("structure").to_series()
         varying = [one for one in LEVELS if one == "joint" or variance[one] > 0]
         names = self.found["structure"].values.tolist()
-        self.seen = {name: check(name, f"whether {name} is seen", on=True) for name in names}
+        self.seen = {name: checkbox(name, f"whether {name} is seen", on=True) for name in names}
         self.colors = {
             name: ipywidgets.ColorPicker(
                 value=COLORS[k % len(COLORS)],
@@ -86,7 +86,7 @@ class Structures(Panel):
         self.redraw(self.paint, *self.colors.values())
         self.show_level(level)
         self.paint()
-        pairs = [together(self.seen[name], self.colors[name]) for name in names]
+        pairs = [unbroken_row(self.seen[name], self.colors[name]) for name in names]
         return [row(self.level, *pairs), *self.views.values()]
 
     def view_of(self, level: str, n_modes: int) -> ModesView:

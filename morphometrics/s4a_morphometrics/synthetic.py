@@ -1,4 +1,4 @@
-"""Two structures of each subject, with known poses and shapes."""
+"""Synthetic subjects with two structures of known poses and shapes."""
 
 import numpy as np
 import xarray as xr
@@ -12,21 +12,21 @@ from s4a.schema import check_count
 from s4a.seeds import RNG, seed_of
 from s4a_morphometrics.several import analyse_structures
 
-AXES = (12.0, 7.0, 5.0)  # mm, half
+AXES = (12.0, 7.0, 5.0)  # semi-axes in mm
 SIDES = {"left": -1.0, "right": 1.0}
-APART = 16.0  # mm from the middle
-TURN, SHIFT = 0.12, 1.5  # standard deviations of poses, rad and mm
-LENGTH, BEND = 0.12, 1.2  # of shapes: a share, and mm
+DISTANCE = 16.0  # mm from the midplane
+ROTATION, TRANSLATION = 0.12, 1.5  # standard deviations of poses, rad and mm
+LENGTH, BEND = 0.12, 1.2  # standard deviations of shapes, relative and in mm
 
 
 def bean(u: ArrayLike, length: float = 0.0, bend: float = 0.0) -> np.ndarray:
-    """Points ``(n, 3)`` in mm of a bent, tapered ellipsoid, of unit vectors ``(n, 3)``.
+    """Map unit vectors ``(n, 3)`` to a bent, tapered ellipsoid ``(n, 3)`` in mm.
 
     Parameters
     ----------
     u : array_like (n, 3)
     length, bend : float
-        How much longer, as a share, and how much more bent, in mm.
+        Relative increase of the length, and increase of the bending in mm.
 
     Examples
     --------
@@ -54,24 +54,23 @@ def subjects(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> dict[str, dict[str, xr.Dataset]]:
-    """Subjects with a left and a right structure in the frame of one scan.
+    """Simulate subjects with a left and a right structure in the frame of one scan.
 
     Parameters
     ----------
     n, n_vertices : int
-        Subjects, and vertices of each structure.
+        Number of subjects, and of vertices of each structure.
     pose, shape : float
-        How much the structures vary in their poses, and in their shapes, which have none of it: 0
-        for not at all.
+        Amount of variation of the poses, and of the shapes without pose; 0 for none.
     seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
     dict of dict of Dataset
         For :func:`s4a_morphometrics.analyse_structures`: ``{"subject_1": {"left": mesh, "right":
-        mesh}, ...}``; each mesh has ``reference_point(vertex, xyz)``, by which those of all
-        subjects correspond.  Vertices
-        lie elsewhere in every subject, and each scan has another frame.
+        mesh}, ...}``; each mesh has ``reference_point(vertex, xyz)``, which defines the
+        correspondence of all subjects.  Every subject has other vertices, and every scan another
+        frame.
 
     Examples
     --------
@@ -84,37 +83,39 @@ def subjects(
     random = np.random.default_rng(seed_of(seed, rng))
     u, T = (sphere(n_vertices)[name].values for name in ("position", "corner_vertex"))
     width = len(str(n))
-    found: dict[str, dict[str, xr.Dataset]] = {}
+    subjects: dict[str, dict[str, xr.Dataset]] = {}
     for i in range(1, n + 1):
         frame = Rotation.from_rotvec(0.3 * random.normal(size=3))
-        place = 20 * random.normal(size=3)
-        of: dict[str, xr.Dataset] = {}
+        offset = 20 * random.normal(size=3)
+        structures: dict[str, xr.Dataset] = {}
         for name, side in SIDES.items():
-            own = u @ Rotation.random(rng=random).as_matrix().T
-            turn, shift, how = random.normal(size=3), random.normal(size=3), random.normal(size=2)
-            X = _without_pose(bean(own, *(shape * how * [LENGTH, BEND])), bean(own), T)
-            X = X * [side, 1, 1] @ Rotation.from_rotvec(pose * TURN * turn).as_matrix().T
-            X = X + [side * APART, 0, 0] + pose * SHIFT * shift
+            points = u @ Rotation.random(rng=random).as_matrix().T
+            rotation, translation = random.normal(size=3), random.normal(size=3)
+            change = shape * random.normal(size=2) * [LENGTH, BEND]
+            X = _without_pose(bean(points, *change), bean(points), T)
+            X = X * [side, 1, 1] @ Rotation.from_rotvec(pose * ROTATION * rotation).as_matrix().T
+            X = X + [side * DISTANCE, 0, 0] + pose * TRANSLATION * translation
             triangles = T if side > 0 else T[:, ::-1]
-            of[name] = as_dataset(frame.apply(X) + place, triangles, reference_point=own)
-        found[f"subject_{i:0{width}d}"] = of
-    return found
+            structures[name] = as_dataset(
+                frame.apply(X) + offset, triangles, reference_point=points
+            )
+        subjects[f"subject_{i:0{width}d}"] = structures
+    return subjects
 
 
 def _without_pose(X, mean, T):
-    """Points moved as one to where they lie best on their mean."""
+    """Align points rigidly to their mean."""
     R, t, _ = rigid_transform(X, mean, vertex_areas(mean, T))
     return X @ R.T + t
 
 
 def example_structures() -> xr.DataTree:
-    """A small study of several structures: six subjects, a left and a right of 200 vertices each.
+    """Analyse a small multi-structure example: six subjects, left and right of 200 vertices.
 
     Returns
     -------
     DataTree
-        As of :func:`s4a_morphometrics.analyse_structures`, in memory, made in some seconds; the
-        same every time.
+        From :func:`s4a_morphometrics.analyse_structures`, in memory; the same in every call.
 
     Examples
     --------

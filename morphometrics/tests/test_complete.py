@@ -9,9 +9,9 @@ from s4a import analyse, cli, insert, synthetic, with_landmarks, write_mesh
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a_morphometrics import calibration, complete, posterior
 from s4a_morphometrics.calibration import (
-    between_ways,
+    between_paths,
     deviation_of,
-    gaps_between_ways,
+    path_differences,
 )
 from s4a_morphometrics.completion import warnings_of
 from s4a_morphometrics.part import cut
@@ -129,8 +129,8 @@ def test_intervals_hold_nine_tenths_of_the_truth(tree, study, found):
     there = found["present"].values
     assert 0.85 < within[there].mean() < 0.99
     assert 0.85 < within[~there].mean() < 0.99
-    assert found.attrs["between_ways"] > found.attrs["added"] > 0
-    assert found.attrs["match_noise"] > found.attrs["between_ways"]
+    assert found.attrs["between_paths"] > found.attrs["added"] > 0
+    assert found.attrs["match_noise"] > found.attrs["between_paths"]
 
 
 def slid(study, names):
@@ -146,20 +146,20 @@ def slid(study, names):
 def test_what_a_match_has_wrong_on_its_own_is_seen_by_going_round_it(study):
     names = study["registration"]["shape"].values.tolist()
     others = [name for name in names if name != study["registration"].attrs["template"]]
-    right = between_ways(gaps_between_ways(model_of(study)))
+    right = between_paths(path_differences(model_of(study)))
     wrong, turned = slid(study, others[:3])  # each is registered onto one of the other three
     assert right < 0.2 * turned
-    assert between_ways(gaps_between_ways(model_of(wrong))) == pytest.approx(turned, rel=0.15)
+    assert between_paths(path_differences(model_of(wrong))) == pytest.approx(turned, rel=0.15)
     alike, _ = slid(study, others)
-    assert between_ways(gaps_between_ways(model_of(alike))) < 0.4 * turned
+    assert between_paths(path_differences(model_of(alike))) < 0.4 * turned
 
 
 def test_a_shape_that_stands_apart_from_the_network_is_registered_onto_no_other(study):
     latent = study["latent"].to_dataset()
-    name = next(iter(gaps_between_ways(model_of(study))))
+    name = next(iter(path_differences(model_of(study))))
     without = study.copy()
     without["latent"] = xr.DataTree(latent.sel(shape=latent["shape"] != name))
-    gaps = gaps_between_ways(model_of(without))
+    gaps = path_differences(model_of(without))
     assert name not in gaps
     assert len(gaps) == 5  # of seven shapes, the template is one
 
@@ -173,9 +173,9 @@ def test_with_fewer_than_two_shapes_beside_the_template_nothing_is_registered_an
     others = [name for name in latent["shape"].values if name != template]
     few = study.copy()
     few["latent"] = xr.DataTree(latent.sel(shape=[template, *others[:n_beside]]))
-    assert calibration.gaps_between_ways(model_of(few)) == {}
-    assert calibration.between_ways({}) == 0
-    said = warnings_of(found.assign_attrs(between_ways=0.0))
+    assert calibration.path_differences(model_of(few)) == {}
+    assert calibration.between_paths({}) == 0
+    said = warnings_of(found.assign_attrs(between_paths=0.0))
     assert any("too narrow" in line for line in said)
     assert not any("too narrow" in line for line in warnings_of(found))
 
@@ -256,7 +256,7 @@ def test_landmarks_say_how_a_part_lies(tree, brain, part, tmp_path):
 def test_what_cannot_be_completed_is_refused_with_the_reason(study, brain, tmp_path):
     X, T = as_arrays(brain)
     small = cut(X, T, X[:, 1] > np.quantile(X[:, 1], 0.93))
-    with pytest.raises(ValueError, match=r"at least 15 % of the template's area is needed, found"):
+    with pytest.raises(ValueError, match=r"at least 15 % of the template's area; found"):
         complete(study, small)
     with pytest.raises(ValueError, match="vertices are not finite"):
         complete(study, (np.full_like(X, np.nan), T))

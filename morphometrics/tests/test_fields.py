@@ -81,7 +81,7 @@ def test_files_of_fields_are_read_as_they_are_written(tmp_path):
             read_scalars(file, "thickness", 4)
     for wrong, message in {
         "a.npz": "an array 'curv' expected, found thickness, other",
-        "a.ply": "a property 'curv' of its vertices expected",
+        "a.ply": "a vertex property 'curv' expected",
         "a.csv": "a column 'curv' expected, found vertex, thickness",
     }.items():
         with pytest.raises(ValueError, match=message):

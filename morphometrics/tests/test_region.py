@@ -25,8 +25,8 @@ def panel(study):
 def draw(panel, polygon, view):
     """What a drag sends."""
     count = panel.scene.drawn_around.get("count", 0) + 1
-    turn = rotation(view).ravel().tolist()
-    panel.scene.drawn_around = {"polygon": polygon, "turn": turn, "count": count}
+    rows = rotation(view).ravel().tolist()
+    panel.scene.drawn_around = {"polygon": polygon, "rotation": rows, "count": count}
 
 
 @pytest.mark.parametrize("n", [2000, 60_000])
@@ -49,7 +49,7 @@ def test_drags_add_and_take_away_and_the_region_goes_into_statistics(panel, stud
     above = panel.region.copy()
     draw(panel, WIDE, "bottom")
     assert panel.region.sum() > above.sum()
-    panel.how.value = REMOVE
+    panel.action.value = REMOVE
     draw(panel, WIDE, "bottom")
     left = panel.region
     assert 0 < left.sum() <= above.sum()
@@ -66,9 +66,9 @@ def test_a_drag_beside_the_surface_says_so_and_changes_nothing(panel):
     draw(panel, WIDE, "top")
     before = panel.region.copy()
     draw(panel, [[8e3, 8e3], [9e3, 8e3], [9e3, 9e3]], "top")
-    assert "no vertex" in panel.message.value
+    assert "no visible vertex" in panel.message.value
     np.testing.assert_array_equal(panel.region, before)
-    panel.how.value = ADD
+    panel.action.value = ADD
     draw(panel, WIDE, "top")
     assert panel.message.value == ""
 

@@ -152,17 +152,17 @@ def test_the_command_takes_a_region_and_a_nuisance(study_folder, tmp_path, capsy
     ]
     assert cli.main([*command, "--regress-out", "age", "--min-confidence", "0.2"]) == 0
     assert "without age" in capsys.readouterr().out
-    assert cli.main([*command, "--label", "999"]) == 2
+    assert cli.main([*command, "--region", "999"]) == 2
     assert "no vertex of the template has the label 999" in capsys.readouterr().err
     with open_study(study_folder) as study:
         template = study["registration"].attrs["template"]
         Y = study[f"original/{template}/position"].values
     np.savetxt(tmp_path / "halves.csv", np.where(Y[:, 0] > 0, 5, 9), "%d")  # the file's vertices
-    halves = ["--label", "5", "--labels", str(tmp_path / "halves.csv")]
+    halves = ["--region", "5", "--labels", str(tmp_path / "halves.csv")]
     assert cli.main([*command, *halves]) == 0
     assert f" of {len(Y)} vertices" in capsys.readouterr().out
     assert cli.main([*command, *halves[2:]]) == 2
-    assert "--labels needs --label" in capsys.readouterr().err
+    assert "--labels needs --region" in capsys.readouterr().err
 
 
 def test_a_mirrored_shape_of_a_region_is_written_on_the_side_of_its_file(study, tmp_path):

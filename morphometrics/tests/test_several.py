@@ -177,8 +177,8 @@ THREE = {f"subject_{i}": TWO for i in (1, 2, 3)}
         (THREE, {"reflect": "left"}, "reflect names 'left', none of the shapes .subject_1, subj"),
         (THREE, {"landmarks": "none"}, "landmarks: a folder needed, with one for each structure"),
         (THREE, {"features": "sulc"}, "structure left: features: no shape has a field 'sulc'"),
-        ({"a b": TWO, "c": TWO}, {}, "shapes need names of letters"),
-        ({"a": {"le/ft": MESH, "right": MESH}}, {}, "shapes need names of letters"),
+        ({"a b": TWO, "c": TWO}, {}, "names of shapes need"),
+        ({"a": {"le/ft": MESH, "right": MESH}}, {}, "names of shapes need"),
         ({"a": {"left": "no.ply", "right": MESH}, "b": TWO}, {}, "left: shape a: no.ply is no fil"),
         (THREE, {"template": "d"}, "template 'd' is none of the shapes"),
         ({"a": TWO, "b": {"left": MESH}}, {}, "least 2 subjects that have it; right has a alone"),
@@ -415,7 +415,7 @@ def looks(hands):
             [1.8, 1.8, -1.8, 0.1],
             [1.8, 1.8, 1.8, 0.1],
             [],
-            ["cannot tell the hand of d, which stayed", "c is of both hands (left -"],
+            ["cannot determine the side of d", "c is of both hands (left -"],
         ),
     ],
 )
@@ -430,4 +430,4 @@ def test_hands_add_up_and_one_subject_alone_is_of_no_hand():
     assert seen_together(both)["a"]["chirality"].values[1] == pytest.approx(2 * 0.81 / np.sqrt(2))
     hand, names, told = mirrored_subjects({"left": {}, "right": {}})
     assert (hand, names) == ({}, [])
-    assert "needs two shapes or more" in told[0]
+    assert "needs at least two shapes" in told[0]

@@ -10,7 +10,13 @@ import xarray as xr
 
 from s4a.analysis.permutation import indicators, standardize
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.input.subjects import is_missing, is_plain_number, listed, odd_cells, odd_words
+from s4a.input.subjects import (
+    is_missing,
+    is_plain_number,
+    listed,
+    non_numeric_cells,
+    non_numeric_text,
+)
 from s4a.method.pca import pca_without
 from s4a.options import Options, with_options
 from s4a.schema import check_type, require, unit_of
@@ -267,9 +273,9 @@ def _plain(values, names, what):
     if values.dtype.kind in "US":
         cells = [cell.strip() for cell in values.astype(str).ravel().tolist()]
         values = np.array(["" if is_missing(cell) else cell for cell in cells])
-        odd = odd_cells(cells) if len(cells) == len(names) else []
+        odd = non_numeric_cells(cells) if len(cells) == len(names) else []
         if odd:
-            raise ValueError(f"{what} {odd_words(odd, names, cells)}")
+            raise ValueError(f"{what} {non_numeric_text(odd, names, cells)}")
         if len(cells) != len(names):
             raise ValueError(f"{what} with several columns needs numbers; found text")
     elif np.isinf(values).any():

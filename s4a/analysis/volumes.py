@@ -14,7 +14,7 @@ from s4a.analysis.inputs import registration_of
 from s4a.analysis.transfer import transfer_labels
 from s4a.geometry.compiled import igl
 from s4a.geometry.mesh import as_arrays
-from s4a.input.annotations import MIRROR as BETWEEN_RAS_AND_LPS
+from s4a.input.annotations import RAS_TO_LPS
 from s4a.input.chirality import in_file
 from s4a.input.labels import read_grid, voxels_marked
 from s4a.schema import unit_of
@@ -160,7 +160,7 @@ def _in_millimetres(mesh, name, Y):
             system or "unknown",
         )
     Y = Y * MILLIMETRES.get(unit, 1.0)
-    return Y * BETWEEN_RAS_AND_LPS if system == "LPS" else Y
+    return Y * RAS_TO_LPS if system == "LPS" else Y
 
 
 def _voxels_within(Y, S, shape, affine):

@@ -21,7 +21,7 @@ from s4a.extensions import extensions
 
 __all__ = ["Command", "add_options", "command", "main", "number_or_name", "parser", "whole"]
 
-PAGE = "https://github.com/OWNER/s4a/blob/HEAD/docs/research.md"
+PAGE = "https://github.com/OWNER/s4a/blob/HEAD/docs/commands.md"
 
 
 class Parser(argparse.ArgumentParser):

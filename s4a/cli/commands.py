@@ -1,11 +1,12 @@
-"""The commands of the command line: from what was typed to what is written and an exit code.
+"""The commands of the command line: each takes parsed arguments and returns an exit code.
 
-The parameters of a command are its arguments and flags (:mod:`s4a.cli.flags`); what is shown is put
-into words in :mod:`s4a.cli.tables`.  What they need is imported when it is first used, so that
-none waits for what the others need.
+The parameters of a command are its arguments and flags (:mod:`s4a.cli.flags`); its output is
+formatted in :mod:`s4a.cli.tables`.  Packages are imported when they are first used, so that help
+appears at once.
 """
 
 import contextlib
+import itertools
 import re
 import shlex
 import sys
@@ -31,7 +32,7 @@ else:
 
 
 def check(paths: list[str], **options: Any) -> int:
-    """Read and clean every file, and say what was found.
+    """Read and clean all files, and report what was found.
 
     Parameters
     ----------
@@ -44,18 +45,18 @@ def check(paths: list[str], **options: Any) -> int:
 
 
 def doctor(folder: str = ".") -> int:
-    """What this machine lacks, and what to type.
+    """Check this machine, and list what is missing and how to install it.
 
     Parameters
     ----------
     folder : FOLDER
-        where studies are to lie (default: here)
+        where studies will be written (default: here)
     """
     findings = examine(folder)
-    lacking = sum(finding.state == "lacks" for finding in findings)
+    missing = sum(finding.state == "missing" for finding in findings)
     notes = sum(finding.state == "note" for finding in findings)
-    write(*lines(findings), f"{lacking} lacking, {notes} to know")
-    return 1 if lacking else 0
+    write(*lines(findings), f"{missing} missing, {notes} to know")
+    return 1 if missing else 0
 
 
 def run(
@@ -91,10 +92,10 @@ def run(
 
 @contextlib.contextmanager
 def on_cluster(address: str | None) -> Iterator[None]:
-    """Run joblib's tasks on a dask scheduler, where there is an address.
+    """Run the tasks of joblib on a dask scheduler, if there is an address.
 
-    ``tcp://host:port``, or ``local:N`` for N processes started here.  The workers must see the
-    study's folder under the same path.
+    ``tcp://host:port``, or ``local:N`` for N processes on this machine.  The workers must see the
+    folder of the study under the same path.
     """
     if address is None:
         yield
@@ -130,9 +131,7 @@ def demo(
     seed: int,
     **options: Any,
 ) -> int:
-    """The whole analysis on the bundled collection, as a page.
-
-    Its accuracy against the truth is printed.
+    """Analyse simulated brains, compare with the ground truth, and write a page.
 
     Parameters
     ----------
@@ -143,7 +142,7 @@ def demo(
     vertices : N
         vertices of each
     dirty
-        with loose parts, holes and non-manifold places
+        add loose parts, holes and non-manifold edges
     open
         open the page in a browser
     """
@@ -170,7 +169,7 @@ def demo(
 
 
 def verify(study: str) -> int:
-    """Whether every file of a study is as it was written, and they belong together.
+    """Verify checksums and provenance of every file of a study.
 
     Parameters
     ----------
@@ -183,7 +182,7 @@ def verify(study: str) -> int:
 
 
 def status(study: str) -> int:
-    """How far a run is, or was when it was stopped.
+    """Show the progress of a run.
 
     Parameters
     ----------
@@ -202,7 +201,7 @@ def view(
     view: str = "corner",
     up: Literal["x", "y", "z"] = "z",
 ) -> int:
-    """One self-contained page of a study.
+    """Write a self-contained HTML page of a study.
 
     Parameters
     ----------
@@ -213,7 +212,7 @@ def view(
     title : TITLE
         of the page (default: name of the folder)
     view : VIEW
-        from where: corner, front, back, left, right, top or bottom (default: corner)
+        viewpoint: corner, front, back, left, right, top or bottom (default: corner)
     up
         axis that points up
     """
@@ -227,7 +226,7 @@ def statistics(
     study: str,
     *,
     group: str | None = None,
-    variable: str | None = None,
+    regress_on: str | None = None,
     covariates: list[str] | None = None,
     table: str | None = None,
     variances: Literal["equal", "unequal"] = "equal",
@@ -236,9 +235,7 @@ def statistics(
     out: str | None = None,
     seed: int,
 ) -> int:
-    """Evaluation of the modes and outliers of a study.
-
-    Tests of groups and variables of its table.
+    """Evaluate the modes of variation, find outliers, and test groups and variables.
 
     Parameters
     ----------
@@ -246,26 +243,26 @@ def statistics(
         its folder
     group : COLUMN
         test and map of the difference between groups; classification
-    variable : COLUMN
+    regress_on : COLUMN
         regression of shape on a number, such as age; its animation
     covariates : COLUMN
-        accounted for in both
+        covariates of both
     table : PATH
         CSV with a column 'shape', in place of the table of the study
     variances
-        of the shapes around what is tested; unequal where groups scatter differently
+        of the residuals; unequal if groups have different covariance
     include_flagged
-        take flagged shapes in
+        include flagged shapes
     permutations : N
         of every test (default: 9999, at every vertex 999, of classes 99)
     out : FOLDER
         for netCDF and CSV (default: STUDY/statistics)
     """
-    if covariates and not (group or variable):
-        raise ValueError("--covariates are of a test: give --group or --variable")
+    if covariates and not (group or regress_on):
+        raise ValueError("--covariates needs a test: give --group or --regress-on")
     tree, out = study_to_test(study, out, table, include_flagged)
     options = {"covariates": covariates, "seed": seed, "variances": variances}
-    write_statistics(tree, out, group, variable, permutations, options)
+    write_statistics(tree, out, group, regress_on, permutations, options)
     return 0
 
 
@@ -293,35 +290,31 @@ def write_statistics(
     if variable:
         regression = results["regression"]
         write("", tables.significance(regression, regression, variable, tree))
-        write_moving(tree, regression, variable, Path(out))
+        moving = s4a.statistics.regression_modes(tree, regression, variable)
+        page = Path(out) / "regression.html"
+        s4a.write_page(moving, page, title=f"Regression on {variable}")
+        s4a.write_film(moving, page.with_suffix(".gif"))
     confidence = tree["registration"]["confidence"].mean().item()
     write(f"\nmean confidence of the registration {confidence:.2f}; results: {out}")
-
-
-def write_moving(study: "xr.DataTree", regression: "xr.Dataset", name: str, out: Path) -> None:
-    """The regression on a variable as a page and as a film."""
-    moving = s4a.statistics.regression_modes(study, regression, name)
-    s4a.write_page(moving, out / "regression.html", title=f"Regression on {name}")
-    s4a.write_film(moving, out / "regression.gif")
 
 
 def study_to_test(
     study: str, out: str | None, table: str | None, include_flagged: bool
 ) -> "tuple[xr.DataTree, str]":
-    """The study with the table and the shapes that are asked for, and the folder of results."""
+    """Return the study with the chosen table and shapes, and the folder of the results."""
     tree, out = s4a.open_study(study), out or str(within(study, "statistics"))
     tree = s4a.input.subjects.with_table(tree, table) if table else tree
     tree = s4a.statistics.with_flagged(tree) if include_flagged else tree
     if flagged := s4a.study.tree.left_out(tree):
         write(
-            f"{len(flagged)} flagged shapes are left out, --include-flagged takes them in: "
+            f"{len(flagged)} flagged shapes are excluded, --include-flagged includes them: "
             f"{s4a.input.plausibility.listed(flagged, 200)}\n"
         )
     return tree, out
 
 
 def labels_in(file: str, mesh: "xr.Dataset") -> "np.ndarray":
-    """Labels of a mesh, from a file with one for each vertex of its file."""
+    """Return the labels of a mesh from a file with a label for each vertex of the mesh file."""
     label = s4a.input.annotations.read_labels(file, mesh.sizes["file_vertex_index"])
     return s4a.input.annotations.labels_of_mesh(label, mesh)
 
@@ -333,7 +326,7 @@ def tests_of(
     permutations: int | None,
     options: dict[str, Any],
 ) -> "dict[str, xr.Dataset]":
-    """The tests of the group and the variable that are asked for."""
+    """Return the results of the tests of the group and of the variable."""
     of_classes = {"seed": options["seed"]}
     if permutations is not None:
         options = options | {"n_permutations": permutations}
@@ -357,7 +350,7 @@ def insert(
     reflect: str | None = None,
     n_jobs: int,
 ) -> int:
-    """New shapes in a finished study, which stays as it is.
+    """Register new shapes to a finished study, which stays unchanged.
 
     Parameters
     ----------
@@ -393,14 +386,14 @@ def transfer(
     n_jobs: int,
     **options: Any,
 ) -> int:
-    """Labels and landmarks of one mesh on others.
+    """Transfer labels and landmarks of one mesh to others.
 
     Parameters
     ----------
     source : SOURCE
         mesh file that the labels and landmarks belong to
     targets : TARGET
-        mesh files, folders or globs; or one study folder, whose options hold unless given
+        mesh files, folders or globs; or one study folder, whose options are the defaults
     labels : FILE
         labels of the source's vertices: NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer
         annot, also .gz
@@ -447,7 +440,7 @@ def transfer(
 def registered_pairs(
     source: "xr.Dataset", targets: list[str], n_jobs: int, options: dict[str, Any]
 ) -> "tuple[xr.DataTree, list[str]]":
-    """The source registered as the template of every target, and the targets that are left out."""
+    """Register the source to every target; return the study and the excluded targets."""
     shapes = s4a.read_shapes(targets, compare=False)
     report = shapes["report"].to_dataset()
     excluded = report["shape"].values[report["status"].values == "excluded"].tolist()
@@ -462,7 +455,7 @@ def registered_pairs(
 def transferred_rows(
     study: "xr.DataTree", carried: "dict[str, xr.DataTree]", out: Path
 ) -> list[list[Any]]:
-    """Write the files of every target; the rows of the table that is shown."""
+    """Write the files of every target, and return the rows of the table that is printed."""
     first, *_ = carried.values()
     meshes = {name: study["original"][name].to_dataset() for name in first.children}
     stems = {
@@ -488,7 +481,7 @@ def transferred_rows(
 
 
 def write_labels(labels: "xr.Dataset", mesh: "xr.Dataset", out: Path, stem: str) -> list[str]:
-    """Write labels and their confidence as NPY, a row for each vertex of the file; the cells."""
+    """Write labels and confidence as NPY, a row for each vertex of the file; return the cells."""
     points = file_points(mesh)
     for name in ("label", "confidence"):
         values, dropped = s4a.input.annotations.labels_of_file(labels[name].values, mesh, points)
@@ -498,7 +491,7 @@ def write_labels(labels: "xr.Dataset", mesh: "xr.Dataset", out: Path, stem: str)
 
 
 def file_points(mesh: "xr.Dataset") -> "np.ndarray":
-    """The vertices of a mesh's file (n, 3), mirrored as it; those kept, where the file is gone."""
+    """Return the vertices of a mesh file (n, 3); NaN for dropped ones if the file is gone."""
     path, label = mesh.attrs.get("path") or "", mesh.attrs.get("label")
     if Path(path).is_file():
         read = s4a.input.labels.read_volume(path, label) if label else s4a.read_mesh(path)
@@ -520,24 +513,24 @@ def compare(
     n_pairs: int,
     **options: Any,
 ) -> int:
-    """The methods of the paper's Table 1 on pairs, or of its Table 2 on a collection.
+    """Compare the methods of the paper on pairs (Table 1) or on a collection (Table 2).
 
     Parameters
     ----------
     paths : SOURCE TARGET
-        the reference and one or more other meshes
+        the reference mesh and one or more others
     collection : PATH
-        Table 2 on these folders, globs or mesh files
+        folders, globs or mesh files of the collection of Table 2
     methods : METHOD
         of kNN, ZO, FMAP+ZO, SCALABLE, RE-MATCH, RE-MATCH refined, registered, registered surface
     truth : FILE
-        for each target, NPY or text: per vertex of its file that of the source's (from 0; -1:
-        none), or x, y, z
+        ground truth for each target, NPY or text: for every vertex of its file the vertex of the
+        source (from 0; -1: none), or x, y, z
     landmarks : PATH
         landmark files of the source and of each target, whose common names guide registration:
         Slicer .mrk.json, CSV or MeshLab .pp
     keep
-        meshes, matches and maps are in compare.nc, too, for the panel that shows them
+        also write meshes, matches and maps to compare.nc, for the panel that shows them
     out : FOLDER
         for compare.nc and compare.png
     """
@@ -548,21 +541,18 @@ def compare(
                 "--collection takes the shapes alone: no SOURCE, TARGET, --truth, --landmarks or "
                 "--keep"
             )
-        found = compare_collection(collection, methods, n_pairs, options)
-        names = [
-            f"{way}, {how}"
-            for way in found["algorithm"].values
-            for how in found["dense_match"].values
-        ]
+        options |= {"n_pairs": n_pairs, "k_init": min(Options.k_init, options["k"])}
+        options |= {"methods": methods} if methods else {}
+        result = found = s4a.compare_collection(collection, **options)
+        ways = itertools.product(found["algorithm"].values, found["dense_match"].values)
+        names = [", ".join(way) for way in ways]
         seconds = found["collection_seconds"].values.reshape(len(names), -1)
-        text, result = tables.collection_table(found), found
+        text = tables.collection_table(found)
     else:
         result = compare_pairs(paths or [], truth, landmarks, options | {"methods": methods}, keep)
         found = result["metrics"].to_dataset() if keep else result
-        names, seconds = (
-            found["algorithm"].values.tolist(),
-            found["block_seconds"].mean("pair").values,
-        )
+        names = found["algorithm"].values.tolist()
+        seconds = found["block_seconds"].mean("pair").values
         blocks = tables.block_table(names, found["block"].values.tolist(), seconds)
         text = f"{tables.comparison_table(found)}\n\n{blocks}"
     folder = new_folder(out)
@@ -577,15 +567,6 @@ def compare(
     return 0
 
 
-def compare_collection(
-    paths: list[str], methods: list[str] | None, n_pairs: int, options: dict[str, Any]
-) -> "xr.Dataset":
-    """Table 2."""
-    k_init = min(Options.k_init, options["k"])
-    methods = methods or list(s4a.evaluation.comparison.COLLECTION_METHODS)
-    return s4a.compare_collection(paths, methods=methods, n_pairs=n_pairs, k_init=k_init, **options)
-
-
 def compare_pairs(
     paths: list[str],
     truth: list[str] | None,
@@ -593,7 +574,7 @@ def compare_pairs(
     options: dict[str, Any],
     keep: bool,
 ) -> Any:
-    """Table 1, a Dataset; a tree with what is to be kept."""
+    """Return Table 1 of pairs, as a Dataset, or with `keep` as a DataTree."""
     if len(paths) < 2:
         raise ValueError("compare needs SOURCE and TARGET, or --collection PATH...")
     source, *targets = paths
@@ -606,14 +587,11 @@ def compare_pairs(
         raise ValueError(
             f"--truth needs a file for each of the {len(files)} targets, found {len(truth)}"
         )
-    known = {
-        name: s4a.evaluation.comparison.read_ground_truth(f)
-        for name, f in zip(names, truth or [], strict=False)
-    }
+    known = map(s4a.evaluation.comparison.read_ground_truth, truth or [])
     return s4a.compare(
         source,
         dict(zip(names, files, strict=True)),
-        truth=known or None,
+        truth=dict(zip(names, known, strict=True)) if truth else None,
         landmarks=landmark_pairs(landmarks, names),
         keep=keep,
         **options,
@@ -623,7 +601,7 @@ def compare_pairs(
 def landmark_pairs(
     files: list[str] | None, targets: list[str]
 ) -> "dict[str, list[np.ndarray]] | None":
-    """Positions of the landmarks that source and target both have by name, for every target."""
+    """Return the positions of the landmarks that the source and each target have in common."""
     if not files:
         return None
     if len(files) != 1 + len(targets):
@@ -649,29 +627,29 @@ def landmark_pairs(
 
 
 def within(study: str, name: str) -> Path:
-    """A file or folder to write in that of a study, which may be of a stranger.
+    """Return a path to write to in the folder of a study, which may come from a stranger.
 
-    Neither it nor what lies in it may be a link, a pipe or a device.
+    Neither the path nor the files in it may be a link, a pipe or a device.
     """
     place = Path(study) / name
     for path in (place, *(sorted(place.iterdir()) if place.is_dir() else [])):
         if path.is_symlink():
-            raise ValueError(f"{path} is a symbolic link, and is not written through: remove it")
+            raise ValueError(f"{path} is a symbolic link, which would be followed: remove it")
         if path.exists() and not path.is_file() and not path.is_dir():
-            raise ValueError(f"{path} is a pipe or a device, and is not written to: remove it")
+            raise ValueError(f"{path} is a pipe or a device, not a file: remove it")
     return place
 
 
 def new_folder(path: str) -> Path:
-    """A folder for results, made where it is not there."""
+    """Return a folder for results, and make it if it does not exist."""
     folder = Path(path)
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
 def write(*texts: str) -> None:
-    """Texts to the output, and new lines; of what a file says, nothing moves the cursor."""
-    from s4a.input.raw import shown  # not by s4a, which the doctor may find broken
+    """Print texts; control characters from files are escaped, so that none moves the cursor."""
+    from s4a.input.raw import shown  # not through s4a, which may be broken when doctor runs
 
     lines = [shown(line) for text in texts for line in text.split("\n")]
     sys.stdout.write("\n".join(lines) + "\n")

@@ -1,7 +1,7 @@
-"""``s4a doctor``: what this machine lacks for S4A, and what to type.
+"""``s4a doctor``: check a machine for what S4A needs.
 
-Every check gives a :class:`Finding`; it imports or writes what a run would, and changes nothing:
-files that it writes are removed.
+Every check returns a :class:`Finding`.  It imports and writes what a run would, and removes the
+files that it has written.
 """
 
 import contextlib
@@ -32,26 +32,26 @@ for name in sys.argv[1:]:
     except Exception as error:
         print(name, *str(error).split())
 """
-# what wrap=True uses, asked of it in a process of its own: a broken one may end the process
+# the test of PyMeshLab for wrap=True, in a process of its own, which a broken library may end
 TRIAL = """
 import pymeshlab
 meshes = pymeshlab.MeshSet(verbose=False)
-print("ok" if hasattr(meshes, "generate_alpha_wrap") else "lacks its filters")
+print("ok" if hasattr(meshes, "generate_alpha_wrap") else "without its filters")
 """
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
+    """Result of one check.
 
     Parameters
     ----------
     what : str
-    state : {"ok", "note", "lacks"}
-        "lacks" is what a run with all defaults needs; "note" what only some commands need.
+    state : {"ok", "note", "missing"}
+        "missing" if a run with all defaults needs it, "note" if only some commands do.
     found : str
     do : str
-        What to type, or what to do.
+        The command to type, or what to do.
     """
 
     what: str
@@ -61,12 +61,12 @@ class Finding:
 
 
 def noted(what: str, is_fine: object, fine: str, otherwise: str, do: str) -> Finding:
-    """That a thing is fine, or a note on it."""
+    """Return a finding that is "ok", or a note."""
     return Finding(what, "ok", fine) if is_fine else Finding(what, "note", otherwise, do)
 
 
 def examine(folder: Path | str = ".") -> list[Finding]:
-    """All findings on this machine, for studies in a folder.
+    """Return all findings on this machine, for studies in a folder.
 
     Examples
     --------
@@ -75,42 +75,39 @@ def examine(folder: Path | str = ".") -> list[Finding]:
     ['ok']
     """
     found = [Finding("Python", "ok", f"{sys.version.split()[0]}, {sys.executable}")]
-    found += [*dependencies(), writable("study folder", Path(folder), "a place for it")]
+    found += [*dependencies(), writable("study folder", Path(folder), "another --out")]
     temporary = Path(tempfile.gettempdir())
     found += [writable("temporary folder", temporary, "export TMPDIR=FOLDER")]
     for check in (cache, memory, cores, threads):
-        with contextlib.suppress(ImportError):  # what does not import is told above
+        with contextlib.suppress(ImportError):  # packages that do not import are reported above
             found.append(check())
     return [*found, disk(Path(folder)), browser(), *extras()]
 
 
 def dependencies() -> Iterator[Finding]:
-    """Packages that S4A needs and that are missing or older than its floor; one finding if none."""
+    """Yield packages that are missing or too old, or one finding if there are none."""
     wrong = []
     for name, floor in needed():
         here = version_of(name)
-        if not here:
-            wrong.append(Finding(name, "lacks", "not installed", f"pip install '{name}>={floor}'"))
-        elif numbers(here) < numbers(floor):
-            told = f"{here}, and {floor} or newer is needed"
-            wrong.append(Finding(name, "lacks", told, f"pip install --upgrade '{name}>={floor}'"))
+        if not here or numbers(here) < numbers(floor):
+            text = f"{here}, and {floor} or newer is needed" if here else "not installed"
+            wrong.append(Finding(name, "missing", text, f"pip install --upgrade '{name}>={floor}'"))
     modules = [MODULES.get(name, name.replace("-", "_")) for name, _ in needed()]
     result = run(IMPORTS, *modules)
     for line in result.stdout.splitlines():
         name, _, error = line.partition(" ")
         if not any(MODULES.get(one.what, one.what) == name for one in wrong):
             doing = f"pip install --force-reinstall {NAMES.get(name, name)}"
-            wrong.append(Finding(name, "lacks", f"does not import: {error}", doing))
+            wrong.append(Finding(name, "missing", f"does not import: {error}", doing))
     if result.returncode:
-        wrong.append(
-            Finding("packages", "lacks", f"end the process: {end_of(result)}", "a new venv")
-        )
-    told = f"S4A {version('s4a')} and the {len(modules)} that it needs"
-    yield from wrong or [Finding("packages", "ok", told)]
+        text = f"end the process: {end_of(result)}"
+        wrong.append(Finding("packages", "missing", text, "a new venv"))
+    text = f"S4A {version('s4a')} and the {len(modules)} packages that it needs"
+    yield from wrong or [Finding("packages", "ok", text)]
 
 
 def needed(extra: str = "") -> list[tuple[str, str]]:
-    """Name and floor of every package that S4A, or one of its extras, requires itself."""
+    """Return name and lowest version of the packages that S4A, or one of its extras, requires."""
     found = []
     for line in requires("s4a") or []:
         of = re.search(r"extra == ['\"](\w+)['\"]", line)
@@ -121,7 +118,7 @@ def needed(extra: str = "") -> list[tuple[str, str]]:
 
 
 def numbers(text: str) -> tuple[int, ...]:
-    """A version as numbers.
+    """Return a version as numbers.
 
     Examples
     --------
@@ -133,7 +130,7 @@ def numbers(text: str) -> tuple[int, ...]:
 
 
 def version_of(name: str) -> str:
-    """The version of a distribution, or nothing where it is not there."""
+    """Return the version of a distribution, empty if it is not installed."""
     try:
         return version(name)
     except PackageNotFoundError:
@@ -141,19 +138,19 @@ def version_of(name: str) -> str:
 
 
 def run(script: str, *words: str) -> subprocess.CompletedProcess[str]:
-    """A script in a process of its own, which a broken library may end."""
+    """Run a script in a process of its own, which a broken library may end."""
     command = [sys.executable, "-c", script, *words]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
 def end_of(result: subprocess.CompletedProcess[str]) -> str:
-    """The last that a process said, or how it ended."""
+    """Return the last line of output of a process, or its exit code."""
     lines = [*result.stdout.splitlines(), *result.stderr.strip().splitlines()]
     return lines[-1] if lines else f"ends its process with {result.returncode}"
 
 
 def wrapping() -> Finding:
-    """Whether PyMeshLab, which only ``wrap=True`` needs, imports and has its filters."""
+    """Check that PyMeshLab, which only ``wrap=True`` needs, imports and has its filters."""
     result = run(TRIAL)
     is_fine = not result.returncode and result.stdout.strip() == "ok"
     fine = f"PyMeshLab {version_of('pymeshlab')}, with its filters"
@@ -161,7 +158,7 @@ def wrapping() -> Finding:
 
 
 def writable(what: str, folder: Path, instead: str) -> Finding:
-    """Whether a file can be made, locked and renamed in a folder, as every run does."""
+    """Check that a file can be made, locked and renamed in a folder, as in every run."""
     try:
         with tempfile.TemporaryDirectory(prefix=".s4a-", dir=folder) as name:
             there = Path(name) / "a"
@@ -171,73 +168,75 @@ def writable(what: str, folder: Path, instead: str) -> Finding:
                 hold(file.fileno())
             there.rename(Path(name) / "b")
     except OSError as error:
-        return Finding(what, "lacks", f"{folder}: {error}", f"give another: {instead}")
+        return Finding(what, "missing", f"{folder}: {error}", f"give another: {instead}")
     return Finding(what, "ok", f"{folder.resolve()} can be written and locked")
 
 
 def cache() -> Finding:
-    """Whether matplotlib can keep its list of fonts."""
+    """Check that matplotlib can write its cache of fonts."""
     import matplotlib
 
     folder = matplotlib.get_cachedir()
-    told = f"{folder} cannot be written: every command that draws looks for all fonts again"
+    text = f"{folder} cannot be written, so every command that draws searches all fonts"
     do = "export MPLCONFIGDIR=FOLDER"
-    return noted("cache of fonts", os.access(folder, os.W_OK), folder, told, do)
+    return noted("cache of fonts", os.access(folder, os.W_OK), folder, text, do)
 
 
 def memory() -> Finding:
-    """Memory that is free now."""
+    """Return the free memory."""
     from s4a.geometry.compiled import psutil
 
     if not psutil:
-        return Finding("memory", "note", "how much is free cannot be seen", "pip install psutil")
+        return Finding("memory", "note", "the free memory is not known", "pip install psutil")
     free = psutil.virtual_memory().available / GIB
-    told = f"{free:.1f} GiB free"
-    few = f"{told}; {LEAST_MEMORY:.0f} is little for large meshes"
-    return noted("memory", free >= LEAST_MEMORY, told, few, "--n-jobs 1, or close other programs")
+    text = f"{free:.1f} GiB free"
+    few = f"{text}; {LEAST_MEMORY:.0f} is little for large meshes"
+    return noted("memory", free >= LEAST_MEMORY, text, few, "--n-jobs 1, or close other programs")
 
 
 def disk(folder: Path) -> Finding:
-    """Room where the study would lie."""
+    """Return the free space where the study would be written."""
     there = next(p for p in (folder.resolve(), *folder.resolve().parents) if p.exists())
     free = shutil.disk_usage(there).free / GIB
-    told = f"{free:.1f} GiB free"
-    return noted("disk", free >= LEAST_DISK, told, f"{told} in {there}", "--out in another place")
+    text = f"{free:.1f} GiB free"
+    return noted(
+        "disk", free >= LEAST_DISK, text, f"{text} in {there}", "give another folder to --out"
+    )
 
 
 def cores() -> Finding:
-    """Cores that this process may use: those of a container or a job, not of the machine."""
+    """Return the cores of this process: those of its container or job, not of the machine."""
     from joblib import cpu_count
 
-    return Finding("cores", "ok", f"{cpu_count()} for this process; --n-jobs takes all by default")
+    return Finding("cores", "ok", f"{cpu_count()} for this process; --n-jobs uses all by default")
 
 
 def threads() -> Finding:
-    """The libraries of linear algebra and how many threads each would start by itself."""
+    """Return the linear algebra libraries and their numbers of threads."""
     import numpy as np
     import scipy.linalg  # loads its own
     from threadpoolctl import threadpool_info
 
     np.linalg.inv(np.eye(2))
     scipy.linalg.inv(np.eye(2))
-    told = ", ".join(
+    text = ", ".join(
         " ".join(f"{pool['internal_api']} {pool['version'] or ''} of {pool['num_threads']}".split())
         for pool in threadpool_info()
     )
-    return Finding("threads", "ok", f"{told}; workers of a run take one each")
+    return Finding("threads", "ok", f"{text}; workers of a run use one each")
 
 
 def browser() -> Finding:
-    """Whether a browser is there to look at pages; the pages themselves are made without."""
+    """Look for a browser for the pages, which are written without one."""
     here = next((name for name in BROWSERS if shutil.which(name)), "")
     if not here and sys.platform in ("darwin", "win32"):
-        here = "that of the system"
-    told = "none found: pages of s4a view are written all the same"
-    return noted("browser", here, here, told, "open them on another machine")
+        here = "browser of the system"
+    text = "none found; s4a view still writes pages"
+    return noted("browser", here, here, text, "open them on another machine")
 
 
 def extras() -> Iterator[Finding]:
-    """The extras for notebooks, the course, clusters and closed surfaces around broken ones."""
+    """Check the extras for notebooks, the course, clusters and watertight wrapping."""
     uses = {"notebook": "panels", "course": "lessons", "cluster": "--cluster", "wrap": "--wrap"}
     for extra, what in uses.items():
         missing = [name for name, _ in needed(extra) if not version_of(name)]
@@ -245,23 +244,22 @@ def extras() -> Iterator[Finding]:
             yield wrapping()
         else:
             do = f"pip install 's4a[{extra}]'"
-            told = f"without {', '.join(missing)}"
-            yield noted(f"for {what}", not missing, f"s4a[{extra}] is there", told, do)
+            text = f"without {', '.join(missing)}"
+            yield noted(f"for {what}", not missing, f"s4a[{extra}] is there", text, do)
 
 
 def lines(findings: list[Finding]) -> list[str]:
-    """Findings as lines, each followed by what to do.
+    """Return the lines of findings, each followed by what to do.
 
     Examples
     --------
     >>> from s4a.cli.doctor import Finding, lines
     >>> print(*lines([Finding("disk", "note", "0.2 GiB free", "--out elsewhere")]), sep="\\n")
-    note   disk              0.2 GiB free
-                             -> --out elsewhere
+    note     disk              0.2 GiB free
+                               -> --out elsewhere
     """
     found = []
     for one in findings:
-        found.append(f"{one.state:<7}{one.what:<18}{one.found}")
-        if one.do:
-            found.append(f"{'':25}-> {one.do}")
+        found.append(f"{one.state:<9}{one.what:<18}{one.found}")
+        found += [f"{'':27}-> {one.do}"] * bool(one.do)
     return found

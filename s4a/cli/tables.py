@@ -1,6 +1,6 @@
-"""What the commands print: results as tables and sentences, Tables 1 and 2 and Fig. 3 as text.
+"""Output of the commands: results as tables and sentences, Tables 1 and 2 and Fig. 3 as text.
 
-Every function gives a text, or the cells of a row; nothing is printed or written here.
+Every function returns a text or the cells of a row; nothing is printed or written here.
 """
 
 import itertools
@@ -33,7 +33,7 @@ COUNTS = {
 # metric: (head of its column, factor, digits)
 METRICS = {
     "geodesic_error": ("error %", 100, 3),
-    "euclidean_error": ("straight %", 100, 3),
+    "euclidean_error": ("Euclidean %", 100, 3),
     "chamfer": ("Chamfer %", 100, 3),
     "hausdorff": ("Hausdorff %", 100, 2),
     "dirichlet": ("Dirichlet", 1, 2),
@@ -50,17 +50,17 @@ LONGEST = 24  # letters of a name
 LARGEST = 3  # stages whose time a summary says
 TRANSFERRED = (
     *("target", "cycle error", "|distortion|", "confidence", "share of votes"),
-    *("labels of dropped vertices", "landmarks", "spread"),
+    *("labels of dropped vertices", "landmarks", "disagreement"),
 )
 
 
 def table(
     rows: Iterable[Sequence[Any]], head: Sequence[str], number: str = "g", width: int = 120
 ) -> str:
-    """Rows of text as aligned columns.
+    """Return rows of text as aligned columns.
 
-    Numbers to the right, those with a fraction in the form `number`, or "-" where they are none; a
-    long last column wrapped at `width` characters.
+    Numbers are aligned to the right, floats in the format `number`, NaN as "-"; the last column is
+    wrapped at `width` characters.
 
     Examples
     --------
@@ -88,12 +88,12 @@ def table(
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell stands to the right."""
+    """Return whether a cell is aligned to the right."""
     return cell == "-" or cell.replace(".", "", 1).isdigit()
 
 
 def wrapped(text: str, width: int, indent: str = "", later: str | None = None) -> list[str]:
-    """Lines of a text, broken at blanks only: paths and words stay whole.
+    """Wrap a text at blanks only, so that paths and words stay whole.
 
     Examples
     --------
@@ -112,7 +112,7 @@ def wrapped(text: str, width: int, indent: str = "", later: str | None = None) -
 
 
 def report_table(report: "xr.Dataset") -> str:
-    """A row for every shape; below it what was found and done, and what looks wrong."""
+    """Return a row for every shape, with what was found and repaired, and warnings, below it."""
     rows, texts = [], []
     for name in report["shape"].values:
         shape = report.sel(shape=name)
@@ -132,16 +132,16 @@ def report_table(report: "xr.Dataset") -> str:
     return "\n".join(whole)
 
 
-FAULTS = ("damaged", "missing", "stale")  # states of files without which a study does not hold
+FAULTS = ("damaged", "missing", "stale")  # states of files that make a study invalid
 
 
 def count_faults(found: "xr.Dataset") -> int:
-    """How many files of :func:`s4a.verify` make that the study does not hold."""
+    """Return the number of files of :func:`s4a.verify` that make the study invalid."""
     return int(np.isin(found["state"].values, FAULTS).sum())
 
 
 def verify_lines(found: "xr.Dataset") -> str:
-    """What :func:`s4a.verify` has found, in one line, and one for each file that is not whole.
+    """Return a summary of :func:`s4a.verify`, and a line for each file with a fault.
 
     Examples
     --------
@@ -155,7 +155,7 @@ def verify_lines(found: "xr.Dataset") -> str:
     counts = {state: states.count(state) for state in ["whole", *states]}
     line = f"{len(states)} files: {', '.join(f'{n} {state}' for state, n in counts.items())}"
     if count_faults(found):
-        line += "; the same `s4a run` again makes what is wrong again, and nothing else"
+        line += "; run the same `s4a run` again to compute these files again"
     rows = zip(found["file"].values, states, found["fault"].values, strict=True)
     return "\n".join(
         [line, *(f"  {file}, {state}: {fault}" for file, state, fault in rows if fault)]
@@ -163,15 +163,14 @@ def verify_lines(found: "xr.Dataset") -> str:
 
 
 def status_lines(status: "Status", now: float) -> str:
-    """How far a run is, at a time in seconds since 1970: a line for each stage."""
-    since, told = (time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(t)) for t in status[3:5])
+    """Return the progress of a run at a time in seconds since 1970: a line for each stage."""
+    since, last = (time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(t)) for t in status[3:5])
     heads = {
         "running": f"running since {since}: process {status.owner} and {status.processes - 1} "
         f"below it, {status.memory:.0f} MiB now",
-        "finished": f"finished at {told}",
-        "stopped": f"stopped, it last told at {told}; the same command goes on where it stopped",
-        "elsewhere": f"on {status.host}, of which this machine knows no more than the study says: "
-        f"it last told at {told}",
+        "finished": f"finished at {last}",
+        "stopped": f"stopped, last seen at {last}; the same command resumes the run",
+        "elsewhere": f"on {status.host}, another machine: last seen at {last}",
     }
     known = (
         status.stages
@@ -190,7 +189,7 @@ def status_lines(status: "Status", now: float) -> str:
 
 
 def stage_cells(stage: "Stage | None", goes_on: bool, now: float) -> list[str]:
-    """How far a stage is, and what it has taken."""
+    """Return the progress of a stage and its costs."""
     if stage is None:
         return ["-"] * 5
     runs = goes_on and not stage.ended
@@ -204,12 +203,12 @@ def stage_cells(stage: "Stage | None", goes_on: bool, now: float) -> list[str]:
 
 
 def with_rest(lines: list[str], most: int) -> list[str]:
-    """At most so many lines, and one that says how many more there are."""
+    """Return at most so many lines, and one with the number of the others."""
     return lines if len(lines) <= most else [*lines[:most], f"  and {len(lines) - most} more"]
 
 
 def run_summary(study: "xr.DataTree", *, again: str = "s4a run FOLDER --out STUDY") -> str:
-    """The end of a run, on one screen: what to decide first, then the shapes and the results.
+    """Return the summary of a run, on one screen: decisions, shapes, results.
 
     Parameters
     ----------
@@ -225,7 +224,7 @@ def run_summary(study: "xr.DataTree", *, again: str = "s4a run FOLDER --out STUD
 
 
 def result_lines(study: "xr.DataTree") -> list[str]:
-    """The median shape, how the shapes are registered, what the first modes explain."""
+    """Return the median shape, the quality of the registration and the variance explained."""
     registration = s4a.analysis.inputs.registration_of(study)
     latent = study["latent"].to_dataset()
     distance = latent["distance_to_limit"].sortby(latent["distance_to_limit"])[:3]
@@ -252,7 +251,7 @@ def result_lines(study: "xr.DataTree") -> list[str]:
 
 
 def cost_lines(report: "xr.Dataset", most: int | None = None) -> list[str]:
-    """Seconds of all stages, in turn, or of those that took most; and the most memory."""
+    """Return the seconds of all stages, or of the longest ones, and the peak memory."""
     spent = dict(zip(report["stage"].values.tolist(), report["seconds"].values, strict=True))
     shown = sorted(spent, key=lambda stage: -spent[stage])[:most] if most else spent
     parts = ", ".join(f"{stage} {spent[stage]:.1f}" for stage in shown)
@@ -262,50 +261,50 @@ def cost_lines(report: "xr.Dataset", most: int | None = None) -> list[str]:
 
 
 def place_lines(study: str, report: str) -> list[str]:
-    """Where the study is, how to look at it, and where every shape is told of."""
+    """Return where the study is, how to view it, and where the report on every shape is."""
     parts = [f"study: {study}", f"pictures: s4a view {study}", f"every shape: {report}"]
     line = "; ".join(parts)
     return [line] if len(line) <= SCREEN else parts
 
 
 def decision_lines(report: "xr.Dataset", again: str = "s4a run FOLDER --out STUDY") -> list[str]:
-    """Flagged shapes by what is flagged, what to do about it, and the commands that do it."""
+    """Return the flagged shapes by kind, with remedies and the commands for them."""
     n = int((report["status"] == "flagged").sum())
     if not n:
         return []
     kept = s4a.options.kept_options(report).get("include_flagged")
-    become = "taken in as they are" if kept else "kept apart: in no modes, no statistics, no median"
-    lines = [f"TO DECIDE: {n} of {report.sizes['shape']} shapes are flagged, and {become}"]
+    become = "included" if kept else "excluded from modes, statistics and the median"
+    lines = [f"TO DECIDE: {n} of {report.sizes['shape']} shapes are flagged and {become}"]
     lines += kind_lines(s4a.input.plausibility.decisions(report))
     if kept:
-        return [*lines, *command_lines("to keep them apart:", again, "", "--include-flagged"), ""]
+        return [*lines, *command_lines("to exclude them:", again, "", "--include-flagged"), ""]
     return [
         *lines,
-        "  to leave one out: take its file away and run again; nothing else changes",
-        *command_lines("to take all of them in:", again, "--include-flagged"),
+        "  to exclude one permanently: remove its file and run again; nothing else changes",
+        *command_lines("to include all of them:", again, "--include-flagged"),
         "",
     ]
 
 
 def command_lines(what: str, command: str, flag: str = "", without: str = "") -> list[str]:
-    """A command for a shell, in lines that fit on the screen; in words where it is long.
+    """Return a command for a shell in lines that fit on the screen, in words if it is long.
 
     Parameters
     ----------
     what : str
-        What it is for.
+        Purpose of the command.
     command : str
-        Without the flags.
+        The command without the flags.
     flag, without : str
-        The flag that it gets, or one that the command of the run has and it does not.
+        A flag to add, or a flag of the run that is left out.
 
     Examples
     --------
     >>> from s4a.cli.tables import command_lines
-    >>> command_lines("to take all of them in:", "s4a run d --out s", "--include-flagged")
-    ['  to take all of them in: s4a run d --out s --include-flagged']
-    >>> command_lines("to take them in:", "s4a run " + 400 * "a.ply ", "--include-flagged")
-    ['  to take them in: the same command with --include-flagged']
+    >>> command_lines("to include all of them:", "s4a run d --out s", "--include-flagged")
+    ['  to include all of them: s4a run d --out s --include-flagged']
+    >>> command_lines("to include them:", "s4a run " + 400 * "a.ply ", "--include-flagged")
+    ['  to include them: the same command with --include-flagged']
     """
     words = [shlex.quote(word).replace(" ", "\0") for word in shlex.split(f"{command} {flag}")]
     lines = wrapped(f"  {what} {' '.join(words)}", SCREEN - 2, "", " " * 6)
@@ -315,7 +314,7 @@ def command_lines(what: str, command: str, flag: str = "", without: str = "") ->
 
 
 def kind_lines(found: "list[Decision]") -> list[str]:
-    """A line for each kind: how many shapes, which ones as there is room, what to do."""
+    """Return a line for each kind: number of shapes, their names, what to do."""
     lines = []
     for one in found:
         room = SCREEN - len(one.kind) - len(one.remedy) - 12
@@ -326,7 +325,7 @@ def kind_lines(found: "list[Decision]") -> list[str]:
 
 
 def excluded_lines(report: "xr.Dataset", most: int) -> list[str]:
-    """The shapes that could not be used, each with its reason; at most so many of them."""
+    """Return the shapes that could not be used with their reasons, at most so many."""
     out = report.sel(shape=report["status"].values == "excluded")
     names = s4a.input.plausibility.shortened(out["shape"].values.tolist(), 20)
     if not names:
@@ -340,7 +339,7 @@ def excluded_lines(report: "xr.Dataset", most: int) -> list[str]:
 
 
 def without_middle(text: str, longest: int) -> str:
-    """A text of at most so many letters: the words in the middle are left out where it has more.
+    """Return a text of at most so many characters, without the words in its middle if needed.
 
     Examples
     --------
@@ -356,7 +355,7 @@ def without_middle(text: str, longest: int) -> str:
 
 
 def short_reason(reason: str, path: str) -> str:
-    """Why a shape is excluded, without the stage and the path, which are said elsewhere.
+    """Return why a shape is excluded, without the stage and the path.
 
     Examples
     --------
@@ -373,7 +372,7 @@ def short_reason(reason: str, path: str) -> str:
 
 
 def remark_lines(report: "xr.Dataset") -> list[str]:
-    """What concerns the collection, shortened, and what else looks wrong with shapes, by kind."""
+    """Return the remarks on the collection, shortened, and the warnings by kind."""
     remarks = report.attrs["remarks"].splitlines()
     lines = [f"  {without_middle(line, SCREEN - 2)}" for line in remarks]
     lines = [*with_rest(lines, MOST_REMARKS), *kind_lines(s4a.input.plausibility.notices(report))]
@@ -381,29 +380,28 @@ def remark_lines(report: "xr.Dataset") -> list[str]:
 
 
 def status_line(report: "xr.Dataset") -> str:
-    """How many shapes there are of each status."""
+    """Return the number of shapes of each status."""
     status = report["status"].values
     kinds = ("ok", "repaired", "flagged", "excluded")
     return f"{len(status)} shapes: {', '.join(f'{(status == k).sum()} {k}' for k in kinds)}"
 
 
 def registration_cells(registration: "xr.Dataset") -> list[str]:
-    """Mean confidence, mean cycle error and median distortion of registrations."""
+    """Return mean confidence, mean cycle error and median distortion of registrations."""
     confidence, round_trip = (registration[v].mean().item() for v in ("confidence", "round_trip"))
     distortion = np.median(np.abs(registration["distortion"]))
     return [f"{confidence:.2f}", f"{round_trip:.4f}", f"{distortion:.3f}"]
 
 
 def landmark_cells(landmarks: "xr.Dataset") -> list[str]:
-    """Mean confidence and spread of landmarks that were carried over."""
-    cells = [f"{landmarks['landmark_confidence'].mean().item():.2f}", "-"]
-    if "landmark_disagreement" in landmarks:
-        cells[1] = f"{landmarks['landmark_disagreement'].mean().item():.3g}"
-    return cells
+    """Return mean confidence and disagreement of transferred landmarks."""
+    cells = {"landmark_confidence": ".2f", "landmark_disagreement": ".3g"}
+    known = {name: landmarks[name].mean().item() for name in cells if name in landmarks}
+    return [f"{known[name]:{form}}" if name in known else "-" for name, form in cells.items()]
 
 
 def true_line(modes: "xr.Dataset", truth: "xr.Dataset") -> str:
-    """How well the scores of the modes follow those that made synthetic shapes."""
+    """Return the correlations of the scores with the true scores of simulated shapes."""
     simulated = truth["true_score"].sel(shape=modes["shape"]).values  # (s, q)
     score = modes["score"].values  # (s, c)
     n = min(simulated.shape[1], score.shape[1])
@@ -413,16 +411,16 @@ def true_line(modes: "xr.Dataset", truth: "xr.Dataset") -> str:
 
 
 def error_table(errors: "xr.Dataset") -> str:
-    """Mean errors of :func:`s4a.evaluation.accuracy.accuracy` over the shapes, a row per method."""
+    """Return the mean errors of :func:`s4a.evaluation.accuracy.accuracy`, a row per method."""
     mean = 100 * errors[["error", "geodesic_error"]].mean("shape")
     rows = zip(
         *(mean[name].values for name in ("algorithm", "error", "geodesic_error")), strict=True
     )
-    return table(rows, ["mean error, % of sqrt(area)", "straight line", "along edges"], ".3f")
+    return table(rows, ["mean error, % of sqrt(area)", "Euclidean", "along edges"], ".3f")
 
 
 def evaluation_table(evaluation: "xr.Dataset") -> str:
-    """Measures by number of components, with their standard errors.
+    """Return measures by number of components, with their standard errors.
 
     Parameters
     ----------
@@ -439,7 +437,7 @@ def evaluation_table(evaluation: "xr.Dataset") -> str:
 
 
 def measure_cell(data: "xr.Dataset", name: str, c: int) -> str:
-    """A measure of so many components and its standard error."""
+    """Return a measure of so many components and its standard error."""
     if c >= data.sizes["component"]:
         return "-"
     value, error = data[name].values[c], data[f"{name}_error"].values[c]
@@ -447,16 +445,16 @@ def measure_cell(data: "xr.Dataset", name: str, c: int) -> str:
 
 
 def significance(whole: "xr.Dataset", where: "xr.Dataset", name: str, study: "xr.DataTree") -> str:
-    """What a test and its map found, in words."""
+    """Return the results of a test and its map in words."""
     mesh = s4a.geometry.mesh.as_arrays(study["registration"].to_dataset())
     area = s4a.geometry.mesh.vertex_areas(*mesh)
     attrs = whole.attrs
     groups = f" ({attrs['groups']})" if "groups" in attrs else ""
     lines = [
         f"{name}{groups}: p = {whole['p_value'].item():.3g} over the whole shape, "
-        f"the smallest that can be reached is {attrs['smallest_p']:.2g}"
+        f"the smallest possible is {attrs['smallest_p']:.2g}"
     ]
-    said = {"covariates": "accounted for", "left_out": "left out, flagged or without a value"}
+    said = {"covariates": "covariates", "left_out": "left out, flagged or without a value"}
     lines += [f"  {words}: {attrs[key]}" for key, words in said.items() if attrs[key]]
     corrections = {"p_family_wise": "family-wise", "p_false_discovery": "false discovery rate"}
     for variable, words in corrections.items():
@@ -469,14 +467,14 @@ def significance(whole: "xr.Dataset", where: "xr.Dataset", name: str, study: "xr
 
 
 def classification_line(result: "xr.Dataset") -> str:
-    """How well groups are told apart by the scores, in words."""
+    """Return the accuracy of a classification in words."""
     share, chance = 100 * result.attrs["balanced_accuracy"], 100 * result.attrs["chance"]
     p = result["p_value"].item()
     return f"classified {share:.0f} % right, chance {chance:.0f} %, p = {p:.3g}"
 
 
 def inserted_table(inserted: "xr.DataTree") -> str:
-    """Where new shapes of :func:`s4a.insert` lie in their study, and what looks wrong with them."""
+    """Return the table of new shapes of :func:`s4a.insert`, with warnings."""
     report, registration = inserted["report"].to_dataset(), inserted["registration"].to_dataset()
     rows, lines = [], []
     for name in report["shape"].values.tolist():
@@ -499,7 +497,7 @@ def inserted_table(inserted: "xr.DataTree") -> str:
 
 
 def score_cells(modes: "xr.Dataset") -> list[str]:
-    """What the modes leave of one shape, how far it lies from the mean, and its first scores."""
+    """Return reconstruction error, Mahalanobis distance and first scores of a shape."""
     return [
         f"{modes['reconstruction_error'].item():.4g}",
         f"{s4a.method.pca.mahalanobis(modes['score'].values):.1f}",
@@ -508,7 +506,7 @@ def score_cells(modes: "xr.Dataset") -> list[str]:
 
 
 def comparison_table(pairs: "xr.Dataset") -> str:
-    """Table 1: mean over the pairs of every metric, and the CPU seconds.
+    """Return Table 1: mean over the pairs of every metric, and the CPU seconds.
 
     Lengths in % of sqrt(area).
     """
@@ -526,13 +524,13 @@ def comparison_table(pairs: "xr.Dataset") -> str:
 
 
 def block_table(methods: Sequence[str], blocks: Sequence[str], seconds: "np.ndarray") -> str:
-    """CPU seconds (m, b) of every method by block (Fig. 3)."""
+    """Return the CPU seconds (m, b) of every method by block (Fig. 3)."""
     rows = [[method, *row, row.sum()] for method, row in zip(methods, seconds, strict=True)]
     return table(rows, ["CPU s", *blocks, "all"], ".1f")
 
 
 def collection_table(result: "xr.Dataset") -> str:
-    """Table 2: mean Chamfer distance to the template, CPU seconds by block, the median shape."""
+    """Return Table 2: mean Chamfer distance to the template, CPU seconds, median shape."""
     rows = []
     for way, how in itertools.product(result["algorithm"].values, result["dense_match"].values):
         method = result.sel(algorithm=way, dense_match=how)
@@ -541,5 +539,5 @@ def collection_table(result: "xr.Dataset") -> str:
         median = method["median_shape"].item()
         rows.append([way, how, f"{chamfer:.4f}", *seconds, seconds.sum(), median])
     blocks = [f"{block}, s" for block in result["block"].values]
-    head = ["method", "way up", "Chamfer %", *blocks, "all, s", "median shape"]
+    head = ["method", "dense match", "Chamfer %", *blocks, "all, s", "median shape"]
     return table(rows, head, ".1f")

@@ -1,4 +1,4 @@
-"""Files of labels and landmarks (6.2): what experts marked on a mesh, in the order of its file."""
+"""Annotations of a mesh (6.2): read and write labels, landmarks and scalar fields."""
 
 import csv
 import io
@@ -20,24 +20,24 @@ from s4a.input.formats import gifti_arrays, ply_properties
 from s4a.input.raw import check_there, content, npy, npz, reading, shown, text_of, xml
 from s4a.schema import dataset, require, unit_of
 
-LONGEST = 255  # characters of a name: an array of names has room for the longest in each place
+LONGEST = 255  # characters of a name, as NumPy pads each text to the longest
 _MARKUPS = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/"
     "Resources/Schema/markups-schema-v1.0.3.json#"
 )
-MIRROR = np.array([-1.0, -1.0, 1.0])  # between RAS and LPS
+RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])  # and back
 
 
 def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
-    """One label per vertex from a file.
+    """Read one label per vertex from a file.
 
     Parameters
     ----------
     path : str or Path
-        NPY; NPZ, ``FILE.npz:NAME`` where several arrays fit; CSV or text, a row per vertex, with a
-        header the column ``label`` and, where there is one, the index ``vertex``; GIFTI label
-        (.gii); FreeSurfer .annot, whose labels are rows of its colour table, -1 for the annotation
-        0; each compressed by gzip too (.annot.gz).
+        NPY; NPZ, ``FILE.npz:NAME`` if several arrays fit; CSV or text with a row per vertex, or
+        with a header, the column ``label`` and optionally the index ``vertex``; GIFTI label (.gii);
+        FreeSurfer .annot, whose labels are rows of the colour table, -1 for annotation 0.  Files
+        may be compressed by gzip (.annot.gz).
     n : int, optional
         Number of vertices in the file of the mesh.
 
@@ -49,7 +49,7 @@ def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
     Raises
     ------
     ValueError
-        When the file is missing, is no label file, or has not `n` values.
+        If the file is missing, cannot be read as labels, or does not have `n` values.
     """
     before, _, name = str(path).partition(".npz:")
     file = Path(f"{before}.npz" if name else before)
@@ -66,12 +66,12 @@ def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
     _check_length(path, labels, n, "label")
     wrong: Any = labels.dtype
     if labels.dtype.kind == "f":
-        broken = (np.round(labels) != labels) | ~(np.abs(labels) < 2**53)
-        if not broken.any():
+        is_fraction = (np.round(labels) != labels) | ~(np.abs(labels) < 2**53)
+        if not is_fraction.any():
             return labels.astype(np.int64)
-        wrong = labels[broken][0]
+        wrong = labels[is_fraction][0]
     if labels.dtype.kind not in "iubU":
-        raise ValueError(f"{shown(path)}: labels need whole numbers or names, found {wrong}")
+        raise ValueError(f"{shown(path)}: labels need integers or names, found {wrong}")
     return labels
 
 
@@ -88,39 +88,39 @@ def _npz_labels(data, file, name, n):
     arrays = npz(data)
     if name:
         if name not in arrays:
-            raise ValueError(f"no array {name!r}; it has {', '.join(arrays)}")
+            raise ValueError(f"an array {name!r} needed, found {', '.join(arrays)}")
         return arrays[name]()
-    found = {key: read() for key, read in arrays.items()}
+    columns = {key: read() for key, read in arrays.items()}
     fitting = [
-        key for key, values in found.items() if values.ndim == 1 and n in (None, len(values))
+        key for key, values in columns.items() if values.ndim == 1 and n in (None, len(values))
     ]
     if len(fitting) != 1:
-        shapes = ", ".join(f"{key} {values.shape}" for key, values in found.items())
+        shapes = ", ".join(f"{key} {values.shape}" for key, values in columns.items())
         wanted = "one array" if n is None else f"one array of {n} values"
         raise ValueError(f"{wanted} needed, found {shapes}; name it as {file}:NAME")
-    return found[fitting[0]]
+    return columns[fitting[0]]
 
 
 def _gifti_labels(data):
     arrays = gifti_arrays(data)
-    found = [values for intent, values in arrays if intent == "LABEL"]
-    found = found or [values for _, values in arrays if values.ndim == 1]
-    if not found:
+    labels = [values for intent, values in arrays if intent == "LABEL"]
+    labels = labels or [values for _, values in arrays if values.ndim == 1]
+    if not labels:
         raise ValueError("a GIFTI array of labels needed, found none")
-    return found[0]
+    return labels[0]
 
 
 class _Cursor:
-    """Big-endian integers, and texts of a length that stands before them, one after the other."""
+    """Reader of consecutive big-endian integers and length-prefixed texts."""
 
     def __init__(self, data):
         self.data, self.at = data, 0
 
     def take(self, count):
-        """The next bytes."""
-        left = len(self.data) - self.at
-        if not 0 <= count <= left:
-            raise ValueError(f"expected {count} bytes, found {left}: the file is cut short")
+        """Read the next bytes."""
+        rest = len(self.data) - self.at
+        if not 0 <= count <= rest:
+            raise ValueError(f"expected {count} bytes, found {rest}: the file is cut short")
         self.at += count
         return self.data[self.at - count : self.at]
 
@@ -132,10 +132,10 @@ class _Cursor:
 
 
 def _annot_labels(data):
-    """Rows of the colour table.
+    """Row of the colour table of each vertex.
 
-    nibabel gives some row to an annotation that is not in the table, and asks for any memory that a
-    damaged count names: of 2,000 damaged files 325 wanted more than 2 GiB.
+    nibabel accepts annotations that are not in the table, and allocates the memory of damaged
+    counts: more than 2 GiB for 325 of 2,000 damaged files.
     """
     file = _Cursor(data)
     vertex, annotation = file.numbers(2 * file.number()).reshape(-1, 2).T
@@ -154,27 +154,27 @@ def _annot_labels(data):
 
 
 def _colour_table(file):
-    """The row of each colour, -1 for none; in version 2, rows are numbered in the file."""
+    """Row of each colour, -1 for none; in version 2, the file numbers the rows."""
     count = file.number()
     numbered = count < 0
     if numbered:
         if count != -2:
             raise ValueError(f"a colour table of version 2 expected, found {-count}")
         file.number()
-    file.take(file.number())  # where it is from
+    file.take(file.number())  # name of the original file
     row_of_colour = {}
     for i in range(file.number() if numbered else count):
         row = file.number() if numbered else i
-        file.take(file.number())  # its name
+        file.take(file.number())  # name of the structure
         red, green, blue, _ = file.numbers(4).tolist()
         row_of_colour.setdefault(red + 256 * green + 65536 * blue, row)
     return row_of_colour | {0: -1}
 
 
 def table_rows(text: str) -> dict[int, list[str]]:
-    """Rows of a table separated by commas, semicolons, tabs or spaces, by the lines they end in.
+    """Split a table at commas, semicolons, tabs or spaces; rows by the number of their last line.
 
-    Empty lines and comments, which begin with ``#``, are none.
+    Empty lines and comments, which begin with ``#``, are skipped.
 
     Examples
     --------
@@ -198,24 +198,24 @@ def table_rows(text: str) -> dict[int, list[str]]:
 
 
 def _check_cells(rows, n, least):
-    """ValueError unless every row has from `least` to `n` cells; more, where those are empty."""
+    """Raise ValueError unless every row has `least` to `n` cells, not counting empty ones after."""
     for line, row in rows.items():
         if len(row) < least or any(row[n:]):
             raise ValueError(
-                f"line {line} needs {n} cells as the first row has, found {len(row)}: "
+                f"line {line} needs {n} cells, as in the first row; found {len(row)}: "
                 f"{', '.join(row)[:60]!r}"
             )
 
 
 def _number_of(cell, line):
-    """The number in a cell; ValueError with its line where there is none."""
+    """Number in a cell, or ValueError with its line."""
     if not is_number(cell):
-        raise ValueError(f"line {line} needs a number where it has {cell[:40]!r}")
+        raise ValueError(f"line {line} needs a number, found {cell[:40]!r}")
     return float(cell)
 
 
 def short(texts: list[str]) -> list[str]:
-    """`texts`, none of which is so long that an array of them would fill the memory."""
+    """Return `texts`; ValueError if one is so long that an array of them could fill the memory."""
     longest = max(map(len, texts), default=0)
     if longest > LONGEST:
         raise ValueError(f"names of at most {LONGEST} characters expected, found one of {longest}")
@@ -223,7 +223,7 @@ def short(texts: list[str]) -> list[str]:
 
 
 def is_number(text: str) -> bool:
-    """Whether a text is that of a number."""
+    """Return whether a text is a number."""
     try:
         float(text)
     except ValueError:
@@ -233,10 +233,10 @@ def is_number(text: str) -> bool:
 
 def _text_labels(data):
     rows = table_rows(text_of(data))
-    first = next(iter(rows.values()))
-    head = [cell.lower() for cell in first]
+    header = next(iter(rows.values()))
+    head = [cell.lower() for cell in header]
     if len(head) > 1 and "label" not in head:
-        raise ValueError(f"a column 'label' needed, found {', '.join(first)}")
+        raise ValueError(f"a column 'label' needed, found {', '.join(header)}")
     at, has_head = (head.index("label"), True) if "label" in head else (0, False)
     cells = _cells(rows, at, has_head)
     if all(map(is_number, cells.values())):
@@ -245,7 +245,7 @@ def _text_labels(data):
 
 
 def _cells(rows, at, has_head):
-    """The cells of a column by their lines, in the order of a column ``vertex`` if there is one."""
+    """Cells of a column by line, in the order of the column ``vertex`` if there is one."""
     n, order, head = len(next(iter(rows.values()))), None, []
     if has_head:
         head = [cell.lower() for cell in rows.pop(next(iter(rows)))]
@@ -256,19 +256,19 @@ def _cells(rows, at, has_head):
 
 
 def _order_of_vertices(head, rows):
-    """The rows of a table in the order of its column ``vertex``; None where it has none.
+    """Order of the rows of a table by its column ``vertex``; None if there is no such column.
 
     Parameters
     ----------
     head : list of str
-        The names of the columns, in lower case.
+        Names of the columns, in lower case.
     rows : dict of int to list of str
-        The cells of each row below, by its line in the file.
+        Cells of each row, by line in the file.
 
     Raises
     ------
     ValueError
-        When the column has not every index once, from 0.
+        If the column does not have every index from 0 once.
     """
     if "vertex" not in head:
         return None
@@ -281,26 +281,26 @@ def _order_of_vertices(head, rows):
 
 
 def read_landmarks(path: Path | str) -> xr.Dataset:
-    """Named points from a file.
+    """Read landmarks from a file.
 
     Parameters
     ----------
     path : str or Path
         3D Slicer .mrk.json (points, curves, closed curves), CSV ``name,x,y,z`` (a header is
         optional; with one, also ``curve``, the name of the curve or empty, and ``closed``), or the
-        XML of MeshLab's picked points (.pp); each compressed by gzip too.
+        XML of MeshLab's picked points (.pp).  Files may be compressed by gzip.
 
     Returns
     -------
     Dataset
-        ``landmark_name(landmark)``, ``landmark_position(landmark, xyz)``; where there are curves,
-        ``landmark_curve`` and ``landmark_closed``, the points in order along each; attribute
-        ``coordinate_system``, RAS or LPS where the file says which, else empty.
+        ``landmark_name(landmark)``, ``landmark_position(landmark, xyz)``; for curves, the points in
+        order with ``landmark_curve`` and ``landmark_closed``; attribute ``coordinate_system``, RAS
+        or LPS, empty if unknown.
 
     Raises
     ------
     ValueError
-        When the file is missing or holds no points, or a curve has one point only.
+        If the file is missing or has no points, or a curve has only one point.
     """
     path = Path(path)
     check_there(path)
@@ -313,13 +313,13 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
             raise ValueError(f"points with finite coordinates needed, found {len(points)}")
         single = [name for name, count in Counter(curve).items() if name and count < 2]
         if single:
-            raise ValueError(f"a curve needs two points or more; {single[0]!r} has one")
+            raise ValueError(f"a curve needs at least two points; {single[0]!r} has one")
         names = short([str(name) or str(i + 1) for i, name in enumerate(names)])
         curve = short([str(name) for name in curve])
-    found = {"landmark_name": np.array(names), "landmark_position": points}
+    data = {"landmark_name": np.array(names), "landmark_position": points}
     if any(curve):
-        found |= {"landmark_curve": np.array(curve), "landmark_closed": np.array(closed, bool)}
-    return dataset({"coordinate_system": system}, **found)
+        data |= {"landmark_curve": np.array(curve), "landmark_closed": np.array(closed, bool)}
+    return dataset({"coordinate_system": system}, **data)
 
 
 def _slicer_points(text):
@@ -341,8 +341,8 @@ def _slicer_points(text):
             (p.get("label", ""), p["position"], curve, m.get("type") == "ClosedCurve")
             for p in points
         ]
-    labels, places, curves, closed = zip(*rows, strict=True) if rows else ((),) * 4
-    return labels, places, systems.pop(), curves, closed
+    labels, positions, curves, closed = zip(*rows, strict=True) if rows else ((),) * 4
+    return labels, positions, systems.pop(), curves, closed
 
 
 def _meshlab_points(text):
@@ -353,22 +353,22 @@ def _meshlab_points(text):
 
 def _table_points(text):
     rows = table_rows(text)
-    first = next(iter(rows.values()))
-    head = [cell.lower() for cell in first]
+    header = next(iter(rows.values()))
+    head = [cell.lower() for cell in header]
     name, curve, closed = None, None, None
     if all(axis in head for axis in "xyz"):
         x = [head.index(axis) for axis in "xyz"]
         name = next((head.index(n) for n in ("name", "label", "landmark") if n in head), None)
         curve, closed = (head.index(n) if n in head else None for n in ("curve", "closed"))
         del rows[next(iter(rows))]
-    elif len(head) in (3, 4) and all(map(is_number, first[-3:])):
+    elif len(head) in (3, 4) and all(map(is_number, header[-3:])):
         x = list(range(len(head) - 3, len(head)))
         name = 0 if len(head) == 4 else None
     else:
-        raise ValueError(f"the columns name, x, y and z needed, found {', '.join(first)}")
+        raise ValueError(f"the columns name, x, y and z needed, found {', '.join(header)}")
     used = [i for i in (*x, name, curve, closed) if i is not None]
     _check_cells(rows, len(head), 1 + max(used))
-    names, curves, rings = (
+    names, curves, is_closed = (
         ["" if i is None else row[i] for row in rows.values()] for i in (name, curve, closed)
     )
     return (
@@ -376,16 +376,16 @@ def _table_points(text):
         [[_number_of(row[i], line) for i in x] for line, row in rows.items()],
         "",
         curves,
-        [c.lower() in ("1", "true", "yes") for c in rings],
+        [c.lower() in ("1", "true", "yes") for c in is_closed],
     )
 
 
 def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
-    """Write landmarks as CSV or, where the name ends in ``.mrk.json``, as 3D Slicer's markups.
+    """Write landmarks as CSV or, if the name ends in ``.mrk.json``, as markups of 3D Slicer.
 
-    A CSV is ``name,x,y,z``, and ``curve,closed`` where there are curves.  Markups are one list of
-    points, and a list for each curve; they say RAS where the attribute ``coordinate_system`` of the
-    landmarks does, and else LPS, which is what 3D Slicer takes where a file does not say.
+    CSV has the columns ``name,x,y,z``, and ``curve,closed`` for curves.  Markups have a list of
+    points and a list for each curve; they are in RAS if the attribute ``coordinate_system`` of the
+    landmarks is, else in LPS, the default of 3D Slicer.
     """
     require(landmarks, "landmark_name", "landmark_position", what="landmarks")
     if Path(path).name.lower().endswith(".mrk.json"):
@@ -405,41 +405,42 @@ def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
 
 
 def _markups(landmarks):
-    """The content of a file of markups, as 3D Slicer writes it."""
+    """Content of a file of markups, as 3D Slicer writes it."""
     system = str(landmarks.attrs.get("coordinate_system") or "LPS")
     unit = unit_of(landmarks["landmark_position"])
-    about = {"coordinateSystem": system} | ({"coordinateUnits": unit} if unit == "mm" else {})
+    frame = {"coordinateSystem": system} | ({"coordinateUnits": unit} if unit == "mm" else {})
     upright = 1.0 if system == "RAS" else -1.0  # the axes of a point are those of RAS
     n = landmarks.sizes["landmark"]
-    plain = np.full(n, "")
-    curves = landmarks["landmark_curve"].values if "landmark_curve" in landmarks else plain
-    closed = landmarks["landmark_closed"].values if "landmark_closed" in landmarks else plain != ""
+    curves = landmarks["landmark_curve"].values if "landmark_curve" in landmarks else np.full(n, "")
+    closed = (
+        landmarks["landmark_closed"].values if "landmark_closed" in landmarks else np.zeros(n, bool)
+    )
     names = landmarks["landmark_name"].values.tolist()
-    places = landmarks["landmark_position"].values.astype(float).tolist()
+    positions = landmarks["landmark_position"].values.astype(float).tolist()
     orientation = [upright, 0.0, 0.0, 0.0, upright, 0.0, 0.0, 0.0, 1.0]
     shared = {"orientation": orientation, "selected": True, "locked": False, "visibility": True}
     points = [
-        {"id": str(i + 1), "label": names[i], "position": places[i]}
+        {"id": str(i + 1), "label": names[i], "position": positions[i]}
         | shared
         | {"positionStatus": "defined"}
-        for i in range(n)
+        for i in range(len(names))
     ]
     lists = []
     for curve in dict.fromkeys(curves.tolist()):
-        of = np.flatnonzero(curves == curve)
-        kind = ("ClosedCurve" if closed[of[0]] else "Curve") if curve else "Fiducial"
+        index = np.flatnonzero(curves == curve)
+        kind = ("ClosedCurve" if closed[index[0]] else "Curve") if curve else "Fiducial"
         named = {"name": curve} if curve else {}
-        lists.append({"type": kind, **named, **about, "controlPoints": [points[i] for i in of]})
+        lists.append({"type": kind, **named, **frame, "controlPoints": [points[i] for i in index]})
     return {"@schema": _MARKUPS, "markups": lists}
 
 
 def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> np.ndarray:
-    """Labels numbered as in the file of a mesh, for the vertices of the cleaned mesh.
+    """Map labels from the vertices of a file to those of the cleaned mesh.
 
     Raises
     ------
     ValueError
-        When there is not one label per vertex of the file.
+        If there is not one label per vertex of the file.
 
     Examples
     --------
@@ -463,7 +464,7 @@ def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> np.ndarray:
 def labels_of_file(
     labels: np.ndarray, mesh: xr.Dataset, points: np.ndarray
 ) -> tuple[np.ndarray, int]:
-    """Labels of a cleaned mesh, for the vertices as numbered in its file.
+    """Map labels from the vertices of a cleaned mesh to those of its file.
 
     Parameters
     ----------
@@ -472,13 +473,13 @@ def labels_of_file(
     mesh : Dataset
         With ``position`` and ``vertex_of_file``.
     points : float ndarray (p, 3)
-        The vertices of the file.
+        Vertices of the file.
 
     Returns
     -------
     labels : ndarray (p,)
-        A vertex that cleaning dropped has that of the nearest vertex that was kept; one that is not
-        finite has that of the vertex before it in the file.
+        Dropped vertices have the label of the nearest remaining vertex; non-finite ones, that of
+        the vertex before it in the file.
     n_dropped : int
     """
     require(mesh, "position", "vertex_of_file", what="mesh")
@@ -488,31 +489,31 @@ def labels_of_file(
             f"the {len(vertex)} vertices of the file of the mesh needed, found {len(points)}"
         )
     dropped = vertex < 0
-    known = dropped & np.isfinite(points).all(axis=1)
-    vertex[known] = cKDTree(mesh["position"].values).query(points[known])[1]
-    last = np.maximum.accumulate(np.where(vertex >= 0, np.arange(len(vertex)), -1))
-    vertex = np.where(last >= 0, vertex[last], 0)
+    finite = dropped & np.isfinite(points).all(axis=1)
+    vertex[finite] = cKDTree(mesh["position"].values).query(points[finite])[1]
+    previous = np.maximum.accumulate(np.where(vertex >= 0, np.arange(len(vertex)), -1))
+    vertex = np.where(previous >= 0, vertex[previous], 0)
     return np.asarray(labels)[vertex], int(dropped.sum())
 
 
 log = logging.getLogger(__name__)
 
-_CURV = b"\xff\xff\xff"  # how FreeSurfer's files of a number per vertex begin
+_CURV = b"\xff\xff\xff"  # first bytes of FreeSurfer's curvature files
 SUFFIXES = (".npy", ".npz", ".ply", ".csv", ".txt", ".gii")
 
 
 def read_scalars(path: Path | str, name: str = "", n: int | None = None) -> np.ndarray:
-    """One number per vertex from a file.
+    """Read one number per vertex from a file.
 
     Parameters
     ----------
     path : str or Path
-        NPY; NPZ, the array `name` where there are several; PLY, the property `name` of its
-        vertices; CSV or text, a row per vertex, with a header the column `name`; GIFTI (.gii), the
-        first array of one dimension; FreeSurfer's curvature files (``lh.curv``, ``lh.thickness``);
-        each compressed by gzip too.
+        NPY; NPZ, the array `name` if there are several; PLY, the vertex property `name`; CSV or
+        text with a row per vertex, the column `name` if there is a header; GIFTI (.gii), the first
+        array of one dimension; FreeSurfer's curvature files (``lh.curv``, ``lh.thickness``).  Files
+        may be compressed by gzip.
     name : str
-        Of the field.
+        Name of the field.
     n : int, optional
         Number of vertices in the file of the mesh.
 
@@ -523,7 +524,7 @@ def read_scalars(path: Path | str, name: str = "", n: int | None = None) -> np.n
     Raises
     ------
     ValueError
-        When the file is missing, holds no such field, or has not `n` values.
+        If the file is missing, has no such field, or does not have `n` values.
 
     Examples
     --------
@@ -548,73 +549,78 @@ def read_scalars(path: Path | str, name: str = "", n: int | None = None) -> np.n
 
 
 def of_vertices(values: Any, mesh: xr.Dataset, what: str) -> np.ndarray:
-    """A field ``(n,)`` on the vertices of a clean mesh, a number for each of these or of its file.
+    """Return a field ``(n,)`` on the vertices of a clean mesh, given for these or for its file.
 
-    ValueError where it is not numbers, has another length, is infinite or NaN everywhere; `what`
-    names it.
+    Raises ValueError, with `what` as the name of the field, if the values are not numbers, have
+    another length, are infinite, or are all NaN.
     """
     values = np.asarray(values)
     if values.dtype.kind not in "iufb":
         raise ValueError(f"{what} needs numbers, found {values.dtype}")
     n = mesh.sizes["vertex"]
-    in_file = mesh.sizes.get("file_vertex_index", n)
-    if values.shape not in ((n,), (in_file,)):
-        of_file = "" if n == in_file else f", or each of the {in_file} of its file"
+    n_file = mesh.sizes.get("file_vertex_index", n)
+    if values.shape not in ((n,), (n_file,)):
+        of_file = "" if n == n_file else f", or each of the {n_file} of its file"
         raise ValueError(
             f"{what} needs a number for each of the {n} vertices of its mesh{of_file}; found shape "
             f"{values.shape}"
         )
-    if len(values) == in_file and "file_vertex" in mesh:
+    if len(values) == n_file and "file_vertex" in mesh:
         values = values[mesh["file_vertex"].values]
     values = values.astype(float)
     if np.isinf(values).any():
         raise ValueError(
-            f"{what} needs finite numbers, or NaN where there is none; {np.isinf(values).sum()} "
+            f"{what} needs finite numbers, or NaN for missing values; {np.isinf(values).sum()} "
             "are infinite"
         )
-    known = values[~np.isnan(values)]
-    if not len(known):
+    finite = values[~np.isnan(values)]
+    if not len(finite):
         raise ValueError(f"{what} is NaN everywhere: leave it out")
-    if len(known) < n:
-        log.warning("%s is NaN at %d of %d vertices", what, n - len(known), n)
-    if np.ptp(known) <= 1e-12 * abs(known).max():
-        log.warning("%s is %.4g everywhere: is it the right file?", what, known[0])
+    if len(finite) < n:
+        log.warning("%s is NaN at %d of %d vertices", what, n - len(finite), n)
+    if np.ptp(finite) <= 1e-12 * abs(finite).max():
+        log.warning("%s is %.4g everywhere: is it the right file?", what, finite[0])
     return values
 
 
 def with_features(
     mesh: xr.Dataset, features: Mapping[str, Any], *, weight: float = 1.0
 ) -> xr.Dataset:
-    """A mesh with fields that guide its registration, such as sulcal depth or curvature.
+    """Add scalar fields that guide the registration, such as sulcal depth or curvature.
 
-    Fields are paired by name.  Those that two shapes have are descriptors of initial maps in far
-    poses, and columns beside position (and normal) where nearest points are searched: in initial
-    maps after ICP and in the elastic iterations.  They are taken as the first K functions have
-    them, and one standard deviation counts as much as 2 % of sqrt(area), times `weight`
+    Fields of two shapes are paired by name.  They are descriptors of the initial map for large pose
+    differences, and coordinates of the nearest-neighbour search, next to position and normal, in
+    initial maps after ICP and in elastic iterations.  Fields are projected onto the first K
+    eigenfunctions.  One standard deviation counts as 2 % of sqrt(area), times `weight`
     (:data:`s4a.method.shape.FIELD_WEIGHT`).
 
     Parameters
     ----------
     mesh : Dataset
-        Clean, as of :func:`s4a.read_shape` or :func:`s4a.clean`.
+        Clean mesh, see :func:`s4a.read_shape` and :func:`s4a.clean`.
     features : dict of str to array_like (vertex,) or path
-        Name -> a number for each vertex of the mesh, or of its file; or a file of them
-        (:func:`s4a.input.annotations.read_scalars`).  NaN counts as the mean.
+        Name -> a number for each vertex of the mesh or of its file; or a file
+        (:func:`s4a.input.annotations.read_scalars`).  NaN is replaced by the mean.
     weight : float
-        Of them all: more where they are to be believed and the surface says little, as on a round
-        one.  All shapes need the same.
+        Weight of all fields; increase it if the surface has few features, as a round one.  All
+        shapes need the same weight.
 
     Returns
     -------
     Dataset
         The mesh with ``feature_name(feature)``, ``feature_value(vertex, feature)`` and
-        ``feature_weight(feature)``; others that it had are gone.
+        ``feature_weight(feature)``, in place of earlier fields.
 
     Raises
     ------
     ValueError
-        When there is none, a file cannot be read, a field does not fit the mesh, or the weight is
+        If there is no field, a file cannot be read, a field does not fit the mesh, or the weight is
         not positive.
+
+    See Also
+    --------
+    with_landmarks : guide the registration by landmarks.
+    analyse : the option ``features`` reads files next to the meshes.
 
     Examples
     --------
@@ -625,79 +631,78 @@ def with_features(
     """
     require(mesh, "position", "corner_vertex", what="mesh")
     if not features:
-        raise ValueError("features needs a field at least, found none")
+        raise ValueError("features needs at least one field, found none")
     if not (np.isfinite(weight) and weight > 0):
         raise ValueError(f"weight must be positive, found {weight!r}")
     fields = {
-        name: read_scalars(given, name) if isinstance(given, str | Path) else given
-        for name, given in features.items()
+        name: read_scalars(field, name) if isinstance(field, str | Path) else field
+        for name, field in features.items()
     }
     values = [of_vertices(field, mesh, f"the feature {name!r}") for name, field in fields.items()]
-    found = dataset(
+    data = dataset(
         feature_name=list(features),
         feature_value=np.stack(values, axis=1),
         feature_weight=np.full(len(values), float(weight)),
     )
-    return mesh.drop_dims("feature", errors="ignore").merge(found)
+    return mesh.drop_dims("feature", errors="ignore").merge(data)
 
 
-def files_beside(path: Path | str, names: Iterable[str]) -> dict[str, Path]:
-    """The files with fields of a mesh, by name: beside its file, or that itself.
+def feature_files(path: Path | str, names: Iterable[str]) -> dict[str, Path]:
+    """Find the files with fields of a mesh, by name of the field.
 
-    Of the field ``sulc`` of ``a.ply`` that is ``a.sulc`` or ``a.sulc.npy``, with any of
-    :data:`SUFFIXES`; or ``a.ply`` where its vertices have a property ``sulc``.
+    The field ``sulc`` of ``a.ply`` is in ``a.sulc`` or ``a.sulc.npy`` (any of :data:`SUFFIXES`) in
+    the same folder, or in ``a.ply`` itself as a vertex property.
 
     Raises
     ------
     ValueError
-        When there are two of one name.
+        If a field has two files.
 
     Examples
     --------
     >>> import tempfile
     >>> from pathlib import Path
     >>> import numpy as np
-    >>> from s4a.input.annotations import files_beside
+    >>> from s4a.input.annotations import feature_files
     >>> folder = Path(tempfile.mkdtemp())
     >>> np.save(folder / "a.sulc.npy", np.zeros(3))
-    >>> [file.name for file in files_beside(folder / "a.ply", ["sulc", "curv"]).values()]
+    >>> [file.name for file in feature_files(folder / "a.ply", ["sulc", "curv"]).values()]
     ['a.sulc.npy']
     """
-    mesh, found = Path(path), {}
+    mesh, file_of = Path(path), {}
     for name in names:
         endings = [end + packed for end in ("", *SUFFIXES) for packed in ("", ".gz")]
-        there = [mesh.with_name(f"{stem_of(mesh)}.{name}{end}") for end in endings]
-        there = [file for file in there if file.is_file()]
-        if len(there) > 1:
+        files = [mesh.with_name(f"{stem_of(mesh)}.{name}{end}") for end in endings]
+        files = [file for file in files if file.is_file()]
+        if len(files) > 1:
             raise ValueError(
-                f"one file with the field {name!r} of {shown(mesh)} needed: "
-                f"{shown(there[0])} and {shown(there[1])}"
+                f"one file with the field {name!r} of {shown(mesh)} needed; found "
+                f"{shown(files[0])} and {shown(files[1])}"
             )
-        if there:
-            found[name] = there[0]
+        if files:
+            file_of[name] = files[0]
         elif mesh.is_file() and name in _properties(mesh):
-            found[name] = mesh
-    return found
+            file_of[name] = mesh
+    return file_of
 
 
 def _properties(path):
-    """The names of what a PLY file has for its vertices; none of another file, or a broken one."""
+    """Vertex properties of a PLY file; empty for other or damaged files."""
     try:
         data = content(path)
         return ply_properties(data) if data[:3] == b"ply" else {}
-    except (ValueError, OSError):  # its own task will say so
+    except (ValueError, OSError):  # reading the mesh will raise the error
         return {}
 
 
 def _values(data, file, name):
-    """The numbers of a file, by what it begins with, or by its suffix."""
+    """Numbers of a file; the format is detected by the first bytes, or the suffix."""
     if data.startswith(_CURV):
         return _curv(data)
     if data[:3] == b"ply":
         columns = ply_properties(data)
         if name not in columns:
-            known = ", ".join(columns)
-            raise ValueError(f"a property {name!r} of its vertices expected, found {known}")
+            raise ValueError(f"a vertex property {name!r} expected, found {', '.join(columns)}")
         return columns[name]
     if zipfile.is_zipfile(io.BytesIO(data)):
         arrays = npz(data)
@@ -708,10 +713,10 @@ def _values(data, file, name):
     if file.endswith(".npy"):
         return npy(data)
     if file.endswith(".gii"):
-        found = [values for _, values in gifti_arrays(data) if values.ndim == 1]
-        if not found:
+        vectors = [values for _, values in gifti_arrays(data) if values.ndim == 1]
+        if not vectors:
             raise ValueError("a GIFTI array of one dimension expected, found none")
-        return found[0]
+        return vectors[0]
     return _column(text_of(data), name)
 
 
@@ -729,10 +734,10 @@ def _curv(data):
 
 
 def _column(text, name):
-    """The column of that name, or the only one."""
+    """Column of that name, or the only one."""
     rows = table_rows(text)
-    first = next(iter(rows.values()))
-    if len(first) > 1 and name not in first:
-        raise ValueError(f"a column {name!r} expected, found {', '.join(first)[:80]}")
-    at, has_head = (first.index(name), True) if len(first) > 1 else (0, not is_number(first[0]))
+    head = next(iter(rows.values()))
+    if len(head) > 1 and name not in head:
+        raise ValueError(f"a column {name!r} expected, found {', '.join(head)[:80]}")
+    at, has_head = (head.index(name), True) if len(head) > 1 else (0, not is_number(head[0]))
     return np.array([_number_of(cell, line) for line, cell in _cells(rows, at, has_head).items()])

@@ -1,8 +1,8 @@
-"""Left and right (5.1, the data): which shapes are mirror images of the others, and their mirror.
+"""Left and right sides (5.1, the data): detect and mirror shapes of the less common side.
 
-Each shape was held against several others, as it is and mirrored
-(:mod:`s4a.input.plausibility`).  The signs that agree best with all of these pairs are those of the
-leading eigenvector of their matrix: no shape is the one that all others are held against.
+Each shape was compared with several references, as it is and mirrored
+(:mod:`s4a.input.plausibility`).  The signs that agree best with all pairs are those of the leading
+eigenvector of the matrix of comparisons, so that no single shape decides.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,16 +13,16 @@ import xarray as xr
 from s4a.input.subjects import listed
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
-COMMON_SIDE, OTHER_SIDE = 0.8, 0.5  # of the mean of `hand` over the references
+COMMON_SIDE, OTHER_SIDE = 0.8, 0.5  # least |mean chirality|: median of all shapes, of one shape
 AUTO = "auto"
-MANY = ("they are", "them", "all that are")
+PLURAL = ("they are", "them", "all that are")
 YES, NO = ("1", "1.0", "true", "yes"), ("0", "0.0", "false", "no")
 
 
 def mirror_image(mesh: xr.Dataset) -> xr.Dataset:
-    """A mesh with x in place of -x, its triangles turned over so that normals stay outward.
+    """Reflect a mesh and its landmarks in x = 0; normals stay outward.
 
-    Its landmarks go with it, and ``reason`` says so.
+    The attributes ``reflected`` and ``reason`` record it.
 
     Examples
     --------
@@ -43,55 +43,58 @@ def mirror_image(mesh: xr.Dataset) -> xr.Dataset:
     for name in ("landmark_barycentric", "guide_barycentric"):
         if name in mesh:
             image[name] = mesh[name].copy(data=mesh[name].values[:, ::-1])
-    turned = np.ascontiguousarray(mesh["corner_vertex"].values[:, ::-1])
-    image["corner_vertex"] = mesh["corner_vertex"].copy(data=turned)
+    flipped = np.ascontiguousarray(mesh["corner_vertex"].values[:, ::-1])
+    image["corner_vertex"] = mesh["corner_vertex"].copy(data=flipped)
     reasons = [mesh.attrs.get("reason", ""), "mirrored, as reflect= says"]
     reflected = 1 - mesh.attrs.get("reflected", 0)
     return image.assign_attrs(reflected=reflected, reason="; ".join(filter(None, reasons)))
 
 
 def in_file(mesh: xr.Dataset, X: np.ndarray) -> np.ndarray:
-    """Points ``(n, 3)`` on a mesh where its file has them, and the other way round."""
+    """Transform points ``(n, 3)`` of a mesh to the frame of its file, or back."""
     return X * MIRROR if mesh.attrs.get("reflected") else X
 
 
-def hands(evidence: Mapping[str, xr.Dataset]) -> np.ndarray:
-    """Of which hand each shape is ``(n,)``: positive as most, or as the first where both are equal.
+def mean_chirality(comparisons: Mapping[str, xr.Dataset]) -> np.ndarray:
+    """Mean chirality of each shape ``(n,)``, positive on the more common side.
+
+    On a tie, the side of the first shape is positive.
 
     Parameters
     ----------
-    evidence : dict of str to Dataset
+    comparisons : dict of str to Dataset
         Name -> :func:`s4a.input.plausibility.compare`.
 
     Returns
     -------
     ndarray
-        Mean over the references of ``hand`` times their sign; near zero where both could be.
+        Mean over the references of ``chirality`` times the sign of the reference; near zero if the
+        side cannot be determined.
     """
-    names = list(evidence)
-    references = next(iter(evidence.values()))["reference"].values.tolist()
-    hand = np.array([seen["chirality"].values for seen in evidence.values()])  # (n, references)
-    of_all = np.full((len(names), len(names)), np.nan)
-    place = [names.index(name) for name in references if name in names]
-    of_all[:, place] = hand[:, [name in names for name in references]]
-    sign = signs(of_all)
-    # of a reference that is none of the shapes: as these see it
-    seen_by = np.nan_to_num(hand.T) @ sign
-    beside = np.where(seen_by < 0, -1, 1)
-    beside[[name in names for name in references]] = sign[place]
-    mean = _mean(hand * beside)
-    other, this = (mean < 0).sum(), (mean > 0).sum()
-    return -mean if (other, mean[0] < 0) > (this, mean[0] > 0) else mean
+    names = list(comparisons)
+    references = next(iter(comparisons.values()))["reference"].values.tolist()
+    chirality = np.array([data["chirality"].values for data in comparisons.values()])  # (n, refs)
+    is_shape = [name in names for name in references]
+    index = [names.index(name) for name in references if name in names]
+    pairs = np.full((len(names), len(names)), np.nan)
+    pairs[:, index] = chirality[:, is_shape]
+    sign = signs(pairs)
+    # a reference that is not among the shapes has the sign that they agree on
+    reference_sign = np.where(np.nan_to_num(chirality.T) @ sign < 0, -1, 1)
+    reference_sign[is_shape] = sign[index]
+    mean = _mean(chirality * reference_sign)
+    negative, positive = (mean < 0).sum(), (mean > 0).sum()
+    return -mean if (negative, mean[0] < 0) > (positive, mean[0] > 0) else mean
 
 
-def signs(likeness: np.ndarray) -> np.ndarray:
-    """Signs ``(n,)`` that agree best with how alike pairs are: of the leading eigenvector.
+def signs(similarity: np.ndarray) -> np.ndarray:
+    """Signs ``(n,)`` that agree best with pairwise similarities, by the leading eigenvector.
 
     Parameters
     ----------
-    likeness : float ndarray (n, n)
-        Positive where two are of one hand, negative where not, NaN where it is not known; what is
-        known both ways counts as its mean.
+    similarity : float ndarray (n, n)
+        Positive for two shapes of the same side, negative for opposite sides, NaN if unknown. Both
+        directions of a pair are averaged.
 
     Examples
     --------
@@ -100,95 +103,99 @@ def signs(likeness: np.ndarray) -> np.ndarray:
     >>> signs(np.array([[np.nan, -2, 1], [-2, np.nan, np.nan], [1, -0.1, np.nan]])).tolist()
     [1, -1, 1]
     """
-    known = np.isfinite(likeness)
-    whole = np.where(known, likeness, 0)
-    both = (whole + whole.T) / np.maximum(known.astype(int) + known.T, 1)
-    leading = np.linalg.eigh(both)[1][:, -1]
+    is_known = np.isfinite(similarity)
+    values = np.where(is_known, similarity, 0)
+    symmetric = (values + values.T) / np.maximum(is_known.astype(int) + is_known.T, 1)
+    leading = np.linalg.eigh(symmetric)[1][:, -1]
     sign = np.where(leading < 0, -1, 1)
     return sign * sign[0]
 
 
-def _mean(hand):
-    known = np.isfinite(hand)
-    return np.where(known, hand, 0).sum(1) / np.maximum(known.sum(1), 1)
+def _mean(chirality):
+    is_known = np.isfinite(chirality)
+    return np.where(is_known, chirality, 0).sum(1) / np.maximum(is_known.sum(1), 1)
 
 
-def mirrored_shapes(evidence: Mapping[str, xr.Dataset]) -> tuple[list[str], list[str]]:
-    """The shapes that ``reflect="auto"`` mirrors: those of the rarer hand; and what is told.
+def mirrored_shapes(comparisons: Mapping[str, xr.Dataset]) -> tuple[list[str], list[str]]:
+    """Return the shapes that ``reflect="auto"`` mirrors, those of the less common side.
 
     Returns
     -------
     names : list of str
-        None where shapes are nearly their own mirror image.
+        Empty if the shapes are nearly mirror-symmetric.
     remarks : list of str
-        In words: which shapes have too weak an evidence, and stay as they are.
+        Shapes whose side is not clear; they are not mirrored.
     """
-    if len(evidence) < 2:
-        return [], ["reflect='auto' needs two shapes or more to hold against each other"]
-    return rarer_side(dict(zip(evidence, hands(evidence).tolist(), strict=True)))
+    if len(comparisons) < 2:
+        return [], ["reflect='auto' needs at least two shapes to compare"]
+    return rarer_side(dict(zip(comparisons, mean_chirality(comparisons).tolist(), strict=True)))
 
 
-def rarer_side(hand: Mapping[str, float]) -> tuple[list[str], list[str]]:
-    """Those of the rarer hand, by :func:`hands` of each, and what is told."""
-    clear = float(np.median(np.abs(list(hand.values()))))
-    if clear < COMMON_SIDE:
+def rarer_side(chirality: Mapping[str, float]) -> tuple[list[str], list[str]]:
+    """Shapes of the less common side, by the :func:`mean_chirality` of each, and remarks."""
+    median = float(np.median(np.abs(list(chirality.values()))))
+    if median < COMMON_SIDE:
         return [], [
-            "reflect='auto' mirrored none: the shapes are too like their own mirror images to tell "
-            f"(mean hand {clear:.2f}, {COMMON_SIDE} needed); name those to mirror"
+            "reflect='auto' mirrored no shape: the shapes are too symmetric to distinguish left "
+            f"and right (median |mean_chirality| {median:.2f}, {COMMON_SIDE} needed); name those "
+            "to mirror"
         ]
-    weak = [name for name, one in hand.items() if abs(one) < OTHER_SIDE]
-    they, them, which = ("it is", "it", "it if it is") if len(weak) == 1 else MANY
+    weak = [name for name, value in chirality.items() if abs(value) < OTHER_SIDE]
+    they, them, which = ("it is", "it", "it if it is") if len(weak) == 1 else PLURAL
     remark = (
-        f"reflect='auto' cannot tell the hand of {listed(weak, most=20)}, which stayed as {they}: "
+        f"reflect='auto' cannot determine the side of {listed(weak, most=20)}, left as {they}: "
         f"look at {them}, and name {which} to be mirrored"
     )
-    return [name for name, one in hand.items() if one <= -OTHER_SIDE], [remark] * bool(weak)
+    mirrored = [name for name, value in chirality.items() if value <= -OTHER_SIDE]
+    return mirrored, [remark] * bool(weak)
 
 
-def is_mirrored(name: str, look: xr.Dataset, known: Mapping[str, xr.Dataset]) -> tuple[bool, str]:
-    """Whether one shape is of the rarer hand beside others, and what is told where it is not known.
+def is_mirrored(
+    name: str, comparison: xr.Dataset, others: Mapping[str, xr.Dataset]
+) -> tuple[bool, str]:
+    """Return whether a shape is of the less common side, and a remark if that is not clear.
 
     Parameters
     ----------
     name : str
-    look : Dataset
+    comparison : Dataset
         Of :func:`s4a.input.plausibility.compare`.
-    known : dict of str to Dataset
-        The same of the others.
+    others : dict of str to Dataset
+        Comparisons of the other shapes.
     """
-    *others, own = hands({**known, "": look})
-    common = float(np.median(np.abs(others)))
-    if common < COMMON_SIDE:
+    *chirality, this = mean_chirality({**others, "": comparison})
+    median = float(np.median(np.abs(chirality)))
+    if median < COMMON_SIDE:
         return False, (
-            f"reflect='auto' left {name} as it is: the shapes of the study are too like their own "
-            f"mirror images to tell (mean hand {common:.2f}, {COMMON_SIDE} needed)"
+            f"reflect='auto' left {name} as it is: the shapes of the study are too symmetric to "
+            f"distinguish left and right (median |mean_chirality| {median:.2f}, {COMMON_SIDE} "
+            "needed)"
         )
-    if abs(own) < OTHER_SIDE:
+    if abs(this) < OTHER_SIDE:
         return False, (
-            f"reflect='auto' cannot tell the hand of {name}, which stayed as it is: look at it, "
+            f"reflect='auto' cannot determine the side of {name}, left as it is: look at it, "
             "and name it if it is to be mirrored"
         )
-    return bool(own <= -OTHER_SIDE), ""
+    return bool(this <= -OTHER_SIDE), ""
 
 
 def to_reflect(reflect: str, names: Sequence[str], table: xr.Dataset | None) -> list[str]:
-    """The shapes that ``reflect=`` names, but for ``"auto"``.
+    """Return the shapes that ``reflect=`` selects, other than ``"auto"``.
 
     Parameters
     ----------
     reflect : str
-        ``"COLUMN=VALUE"`` or a column of yes and no (1 and 0) of the table, or names of shapes
-        with commas between them.
+        ``"COLUMN=VALUE"``, a column of yes and no (1 and 0) of the table, or names of shapes
+        separated by commas.
     names : list of str
-        Of all shapes.
+        Names of all shapes.
     table : Dataset, optional
         ``/subjects``.
 
     Raises
     ------
     ValueError
-        When a name is none of the shapes, a column is not in the table or lacks a value, or no
-        shape would be mirrored.
+        If a name is not a shape, a column is missing or lacks a value, or no shape is selected.
 
     Examples
     --------
@@ -204,25 +211,25 @@ def to_reflect(reflect: str, names: Sequence[str], table: xr.Dataset | None) -> 
         chosen = _rows_of(table, column, value if is_value else None)
     elif is_value:
         raise ValueError(
-            f"reflect={reflect!r} needs a table with the column {column!r}; it has "
-            f"{', '.join(columns) or 'none: give table= (--table FILE)'}"
+            f"reflect={reflect!r} needs a table with the column {column!r}; found "
+            f"{', '.join(columns) or 'no table: give table= (--table FILE)'}"
         )
     else:
         chosen = [name.strip() for name in reflect.split(",")]
     unknown = [name for name in chosen if name not in names]
     if unknown:
         raise ValueError(
-            f"reflect names {listed(list(map(repr, unknown)))}, none of the shapes "
-            f"({listed(list(names), most=8)}), and no column of the table "
-            f"({', '.join(columns) or 'there is none'})"
+            f"reflect={reflect!r}: {listed(list(map(repr, unknown)))} is not a shape "
+            f"({listed(list(names), most=8)}) or a column of the table "
+            f"({', '.join(columns) or 'no table'})"
         )
     if not chosen:
-        raise ValueError(f"reflect={reflect!r} mirrors none of the {len(names)} shapes")
+        raise ValueError(f"reflect={reflect!r} selects none of the {len(names)} shapes")
     return [name for name in names if name in chosen]
 
 
 def _rows_of(table, column, value):
-    """The shapes whose cell in a column is the value, or yes."""
+    """Shapes whose cell in a column is the value, or yes."""
     cells = dict(zip(table["shape"].values.tolist(), table[column].values.tolist(), strict=True))
     words = {name: str(cell).strip() for name, cell in cells.items()}
     missing = [name for name, word in words.items() if word in ("", "nan")]
@@ -235,10 +242,10 @@ def _rows_of(table, column, value):
                 f"{listed(sorted(set(words.values())))}"
             )
         return [name for name, word in words.items() if word == value]
-    odd = [word for word in words.values() if word.lower() not in (*YES, *NO)]
-    if odd:
+    invalid = [word for word in words.values() if word.lower() not in (*YES, *NO)]
+    if invalid:
         raise ValueError(
-            f"reflect={column!r} needs a column of 1 and 0, or a value as {column}={odd[0]}; "
-            f"found {listed(sorted(set(odd)))}"
+            f"reflect={column!r} needs a column of 1 and 0, or a value, {column}={invalid[0]}; "
+            f"found {listed(sorted(set(invalid)))}"
         )
     return [name for name, word in words.items() if word.lower() in YES]

@@ -1,7 +1,7 @@
 """Cleaning (4.1, before step 1): from the triangles of a file to an oriented manifold surface.
 
-What makes the triangles a manifold, edge by edge, is in :mod:`s4a.input.clean`, which says how
-half-edges are counted.
+Half-edge ``h = t + m * i`` of m triangles runs from corner i of triangle t to its next corner; its
+mate is the half-edge of the neighbour across the edge, -1 if there is none.
 """
 
 import numpy as np
@@ -25,13 +25,13 @@ from s4a.geometry.mesh import (
 from s4a.options import check_components
 from s4a.schema import require
 
-# of the diagonal of the bounding box: nearer vertices are one, lower triangles are flat
+# share of the bounding-box diagonal within which vertices are welded and triangles are flat
 _RELATIVE_TOLERANCE = 1e-7
-# largest coordinate, and one over the least extent: sums of squares stay in float32, which holds
-# the displacements (1e-38 to 3e38)
+# largest coordinate, and one over the least extent: sums of squares stay within the range of
+# float32 (1e-38 to 3e38), in which displacements are stored
 LARGEST = 1e15
-# largest coordinate beside the extent: from here on rounding is over 1 % of the extent in float32;
-# in float64 the frame of a shape is 1e-4 of its extent off (measured for offsets of 1e13 and 1e14)
+# largest coordinate over extent: beyond, rounding exceeds 1 % of the extent in float32, and
+# the frame of a shape is off by 1e-4 of its extent in float64 (measured for 1e13 and 1e14)
 _FARTHEST = {"float32": 1e5, "float64": 1e11}
 
 REPAIRS = {
@@ -44,7 +44,7 @@ REPAIRS = {
     "nonmanifold_edges": "non-manifold edges separated",
     "cut_edges": "sides of edges cut open",
     "split_vertices": "vertices added by splitting non-manifold ones",
-    "inserted_vertices": "vertices inserted on edges that met twice",
+    "inserted_vertices": "vertices inserted on double edges",
     "reoriented_triangles": "triangles reoriented",
     "dropped_components": "components dropped",
     "unreferenced_vertices": "vertices without triangles dropped",
@@ -69,11 +69,10 @@ def clean(
 ) -> xr.Dataset:
     """Make a mesh an oriented edge- and vertex-manifold surface.
 
-    Vertices nearer than 1e-7 of the bounding-box diagonal are welded, degenerate and duplicate
-    triangles dropped, zero-area triangles removed by flipping their long edge (collapsed where two
-    of their corners weld), non-manifold edges and vertices separated into sheets, triangles
-    oriented consistently and outwards, small components dropped. Holes stay as they are unless
-    `close_holes` is set.
+    Vertices within 1e-7 of the bounding-box diagonal are welded.  Degenerate and duplicate
+    triangles are dropped, and zero-area triangles are removed by flipping their long edge.
+    Non-manifold edges and vertices are split [1]_, triangles are oriented consistently and
+    outwards, and small components are dropped.  Holes are kept unless `close_holes` is set.
 
     Parameters
     ----------
@@ -82,29 +81,38 @@ def clean(
     components : "largest", "all" or int
         Keep the component with the largest area, all of them, or that many of the largest.
     strict : bool
-        Refuse vertices that are not finite instead of removing them with their triangles.
+        Raise an error for vertices that are not finite; by default they are removed.
     close_holes : bool
-        Close every hole by a fan of triangles around a new vertex, see
-        :func:`s4a.input.clean.fill_holes`.
+        Close every hole by a fan of triangles, see :func:`s4a.input.clean.fill_holes`.
 
     Returns
     -------
     Dataset
-        With ``position``, ``corner_vertex``, ``file_vertex`` (several vertices share one where it
-        was split) and ``vertex_of_file``; what was found and repaired is counted in the attributes,
-        see :func:`clean_arrays`, and summed up as ``status`` (ok or repaired) and ``reason``.
+        With ``position``, ``corner_vertex``, ``file_vertex`` (copies of a split vertex share one)
+        and ``vertex_of_file``.  Repairs are counted in the attributes, see :func:`clean_arrays`,
+        and summarized as ``status`` (ok or repaired) and ``reason``.
 
     Raises
     ------
     ValueError
-        When indices are out of range, coordinates are too large or too near to each other to
-        compute with, nothing is left, or the largest component has under half of the area.
+        If indices are out of range, coordinates are outside the numerical range, no triangle is
+        left, or the largest component has under half of the area.
+
+    See Also
+    --------
+    read_shape : read a file and clean it.
+    coarsen : remesh at low resolution.
+
+    References
+    ----------
+    .. [1] A. Guéziec, G. Taubin, F. Lazarus, W. Horn, "Cutting and stitching: converting sets of
+       polygons to manifold surfaces", IEEE TVCG 7(2), 2001.
 
     Examples
     --------
     >>> import s4a
     >>> from s4a.geometry.mesh import as_dataset
-    >>> tetrahedron = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3], [0, 1, 3]]  # one twice
+    >>> tetrahedron = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3], [0, 1, 3]]  # last: a duplicate
     >>> mesh = s4a.clean(as_dataset([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], tetrahedron))
     >>> mesh.sizes["triangle"], mesh.attrs["duplicate_triangles"], mesh.attrs["genus"]
     (4, 1, 0)
@@ -116,8 +124,8 @@ def clean(
     reason = repairs(counts)
     status = "repaired" if reason else "ok"
     if counts["holes"]:
-        kept = counted(counts["holes"], "holes kept as boundary (close_holes=True closes them)")
-        reason = "; ".join(filter(None, [reason, kept]))
+        holes = counted(counts["holes"], "holes kept as boundary (close_holes=True closes them)")
+        reason = "; ".join(filter(None, [reason, holes]))
     attrs = {**mesh.attrs, **counts, "status": status, "reason": reason}
     return as_dataset(X, T, attrs, file_vertex=file_vertex, vertex_of_file=vertex_of_file)
 
@@ -130,22 +138,21 @@ def clean_arrays(
     strict: bool = False,
     close_holes: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, int | float]]:
-    """Clean a surface of arrays as :func:`clean` does a Dataset.
+    """Clean a mesh given as arrays; see :func:`clean`.
 
     Returns
     -------
     X : float ndarray (n, 3)
     T : int32 ndarray (m, 3)
     file_vertex : int32 ndarray (n,)
-        Row of `points` that each vertex is; a vertex inserted on an edge has that of one end, one
-        in a hole that of a vertex around it.
+        Row of `points` of each vertex; a vertex inserted on an edge or in a hole has the row of a
+        neighbour.
     vertex_of_file : int32 ndarray (len(points),)
-        A vertex that each row of `points` became, -1 where it was dropped.
+        Vertex of each row of `points`, -1 if it was dropped.
     counts : dict of str to int
-        The keys of :data:`REPAIRS`, sizes of the input (``file_vertices``, ``file_triangles``),
-        ``components`` found, and of the result ``holes`` (boundary loops), ``euler_characteristic``
-        and ``genus`` (sum over components); and ``area`` and ``area_dropped``, the share of it in
-        the dropped components.
+        The keys of :data:`REPAIRS`; ``file_vertices``, ``file_triangles`` and ``components`` of the
+        input; ``holes`` (boundary loops), ``euler_characteristic``, ``genus`` (sum over components)
+        and ``area`` of the result; ``area_dropped``, the share in dropped components.
     """
     P, F = check_arrays(points, triangles)
     check_components(components)
@@ -165,9 +172,9 @@ def clean_arrays(
     V, file_vertex = _join_corners(F, mate)
     counts["split_vertices"] = len(file_vertex) - n_used(group[F])
     X, T, file_vertex = _split_double_edges(P[file_vertex], V, file_vertex, mate, counts)
-    X, T, kept = _keep_components(X, T, components, counts)
-    new = np.where(kept, np.cumsum(kept) - 1, -1)
-    T, file_vertex = new[T], file_vertex[kept]
+    X, T, is_kept = _keep_components(X, T, components, counts)
+    new = np.where(is_kept, np.cumsum(is_kept) - 1, -1)
+    T, file_vertex = new[T], file_vertex[is_kept]
     if close_holes:
         X, T, nearby = fill_holes(X, T)
         file_vertex = np.r_[file_vertex, file_vertex[nearby]]
@@ -179,7 +186,7 @@ def clean_arrays(
 
 
 def repairs(counts: dict[str, int | float]) -> str:
-    """What was repaired, in words; empty when the file was a clean surface.
+    """Summarize the repairs in words; empty if there were none.
 
     Examples
     --------
@@ -197,7 +204,7 @@ def repairs(counts: dict[str, int | float]) -> str:
 
 
 def counted(n: float, text: str) -> str:
-    """A number before what it counts, which is one or many.
+    """Put a number before its noun, in singular or plural.
 
     Examples
     --------
@@ -206,13 +213,13 @@ def counted(n: float, text: str) -> str:
     ('1 hole closed', '2 holes closed')
     """
     if n == 1:
-        many = next(word for word in text.split() if word in _SINGULAR)
-        text = text.replace(many, _SINGULAR[many], 1)
+        plural = next(word for word in text.split() if word in _SINGULAR)
+        text = text.replace(plural, _SINGULAR[plural], 1)
     return f"{n} {text}"
 
 
 def check_arrays(points: ArrayLike, triangles: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Points ``(n, 3)`` as float64 and triangles ``(m, 3)`` as int64, or ValueError."""
+    """Convert points ``(n, 3)`` to float64 and triangles ``(m, 3)`` to int64, or ValueError."""
     P, F = np.asarray(points, np.float64), np.asarray(triangles)
     if P.ndim != 2 or P.shape[1] != 3 or F.ndim != 2 or F.shape[1] != 3 or len(F) == 0:
         raise ValueError(
@@ -221,10 +228,10 @@ def check_arrays(points: ArrayLike, triangles: ArrayLike) -> tuple[np.ndarray, n
     if not np.issubdtype(F.dtype, np.integer):
         raise ValueError(f"triangles need integer vertex indices; found {F.dtype}")
     if F.min() < 0 or F.max() >= len(P):
-        wrong = ((F < 0) | (F >= len(P))).any(axis=1).sum()
+        n_wrong = ((F < 0) | (F >= len(P))).any(axis=1).sum()
         raise ValueError(
             f"triangles need vertex indices 0..{len(P) - 1}, as there are {len(P)} vertices; "
-            f"found {F.min()}..{F.max()}, {wrong} triangles out of range"
+            f"found {F.min()}..{F.max()}, {n_wrong} triangles out of range"
         )
     return P, F.astype(np.int64)
 
@@ -242,13 +249,13 @@ def _drop_nonfinite(P, F, strict, counts):
 
 
 def check_range(P: np.ndarray, F: np.ndarray) -> None:
-    """ValueError where coordinates are too large, or too near to each other, to compute with.
+    """Raise ValueError if coordinates are outside the numerical range.
 
     Parameters
     ----------
     P : float ndarray (p, 3)
     F : int ndarray (m, 3)
-        Vertices in none of these triangles are not looked at.
+        Other vertices are not checked.
 
     Examples
     --------
@@ -272,68 +279,68 @@ def check_range(P: np.ndarray, F: np.ndarray) -> None:
     precision = "float32" if np.array_equal(X, X.astype(np.float32)) else "float64"
     if size > _FARTHEST[precision] * extent > 0:
         raise ValueError(
-            f"the shape is lost in rounding: its extent is {extent:.2g}, its coordinates, which "
-            f"are of {precision}, reach {size:.1e}; subtract the offset before it is written"
+            f"the shape is lost in rounding: the extent is {extent:.2g}, but {precision} "
+            f"coordinates reach {size:.1e}; subtract the offset before the file is written"
         )
 
 
 def _weld(P, F, counts):
-    """The group of coincident vertices of each row of P, -1 where no triangle uses it."""
+    """Group of coincident vertices of each row of P, -1 if no triangle uses it."""
     used = np.flatnonzero(np.bincount(F.ravel()))
     X = P[used]
     side = _sides(P, F)
     if not side.any():
-        raise ValueError(f"a surface needs extent; all {len(F)} triangles are points")
-    # the median side guards against a far outlier, whose bounding box would weld the whole shape
+        raise ValueError(f"a surface with area needed; all {len(F)} triangles are points")
+    # the median side limits the tolerance if an outlier enlarges the bounding box
     diagonal = np.linalg.norm(np.ptp(X, axis=0))
     tolerance = min(_RELATIVE_TOLERANCE * diagonal, 1e-3 * np.median(side[side > 0]))
-    first, place = equal_rows(X)
+    first, inverse = equal_rows(X)
     label = components(_near_pairs(X[first], tolerance), len(first))
     group = np.full(len(P), -1)
-    group[used] = label[place]
+    group[used] = label[inverse]
     counts["welded_vertices"] = int(len(used) - label.max() - 1)
     return group, tolerance
 
 
 def _near_pairs(X, tolerance):
     """Pairs of points within the tolerance ``(p, 2)``."""
-    # candidates have another so near along a line: few even of a lattice of voxels
+    # candidates are within the tolerance along a line too: few, even on a voxel lattice
     along = (X - np.median(X, axis=0)) @ (np.sqrt([1.0, 2.0, 3.0]) / np.sqrt(6))
     order = np.argsort(along)
-    close = np.diff(along[order]) <= 1.001 * tolerance  # with what rounding may add
+    close = np.diff(along[order]) <= 1.001 * tolerance  # with a margin for rounding
     near = order[np.append(close, False) | np.append(False, close)]
     tree = cKDTree(X[near], balanced_tree=False, compact_nodes=False)
-    crowd = tree.count_neighbors(tree, tolerance) / len(X)
-    if crowd > 100:  # the pairs would fill the memory
+    neighbours = tree.count_neighbors(tree, tolerance) / len(X)
+    if neighbours > 100:  # the pairs would fill the memory
         raise ValueError(
-            f"vertices crowd: each has {crowd:.0f} others within 1e-7 of the extent "
+            f"distinct vertices needed; each has {neighbours:.0f} others within 1e-7 of the extent "
             f"({tolerance:.1e})"
         )
     return near[tree.query_pairs(tolerance, output_type="ndarray").astype(np.int64)]
 
 
 def _drop_repeated(F, group, counts):
-    """Without triangles that repeat a corner, and of triangles with the same corners one."""
+    """Drop triangles that repeat a corner, and duplicate triangles."""
     T = np.sort(group[F], axis=1)
     good = (T[:, 0] != T[:, 1]) & (T[:, 1] != T[:, 2])
     counts["degenerate_triangles"] = int((~good).sum())
     F, T = F[good], T[good]
-    first, place = equal_rows(T)
+    first, inverse = equal_rows(T)
     counts["duplicate_triangles"] = len(T) - len(first)
     if len(first) == len(T):
         return F
-    copies = np.bincount(place)
+    copies = np.bincount(inverse)
     cancel = _touching_components(T[first], copies % 2 == 0)
     counts["duplicate_triangles"] += int(cancel.sum())
     return F[np.sort(first[~cancel])]
 
 
 def _touching_components(T, even):
-    """Where two sheets touch, among the triangles that lie there an even number of times.
+    """Mask of the triangles with an even number of copies where two surfaces touch.
 
-    Around a patch of them the other triangles meet in pairs, so that to keep one copy would leave a
-    fin; around a superfluous copy they are single.  Decided patch by patch, by most of the edges
-    around it that have others.
+    Around a patch where surfaces touch, the other triangles meet in pairs: keeping one copy would
+    leave a fin.  Around a superfluous copy they are single.  Each patch is decided by the majority
+    of the edges around it.
     """
     E, edge_of, count = unique_edges(T)
     triangle = np.tile(np.arange(len(T)), 3)  # of each half-edge
@@ -349,11 +356,10 @@ def _touching_components(T, even):
 
 
 def _flip_flat(P, F, group, tolerance, counts, iterations=50):
-    """Without triangles lower than the tolerance, whose middle vertex lies on the long edge.
+    """Remove triangles lower than the tolerance, whose middle vertex lies on the long edge.
 
-    To delete one would open a crack: the long edge is flipped with the neighbour across.  Deleted
-    are those whose long edge is a boundary, where nothing opens, and those that no flip helps and
-    that have no height at all.
+    Deleting such a triangle would open a crack, so its long edge is flipped with the neighbour.
+    Triangles whose long edge is a boundary, and degenerate ones that no flip improves, are deleted.
     """
     F, alive = F.copy(), np.ones(len(F), bool)
     suspects = np.arange(len(F))
@@ -376,22 +382,22 @@ def _flip_flat(P, F, group, tolerance, counts, iterations=50):
 
 
 def _flips(P, F, group, flat, tolerance):
-    """Flips of the long edges of flat triangles, each triangle in one at most.
+    """Find flips of the long edges of flat triangles, each triangle in at most one.
 
     Returns
     -------
     pairs : int ndarray (c, 2)
-        The triangles to be replaced: a flat one and its neighbour across the long edge.
+        The triangles to replace: a flat one and its neighbour across the long edge.
     flipped : int ndarray (c, 2, 3)
-        What replaces them.
+        Their replacements.
     at_boundary : int ndarray
         The flat triangles whose long edge is a boundary.
     """
     #      d                   d
-    #    /   \               / | \       q p b is flat: b lies on the long edge, and may lie beyond;
-    #   p-----q     ->      p  |  q      p q d keeps its orientation, as it has the area
+    #    /   \               / | \       q p b is flat: b lies on the long edge, or beyond it;
+    #   p-----q     ->      p  |  q      p q d, which has the area, keeps its orientation
     #    \.b./               \.b./
-    m, corner = len(F), F.T.ravel()  # corner h starts half-edge h, see s4a.input.clean
+    m, corner = len(F), F.T.ravel()  # corner h starts half-edge h
     E, edge_of, count = unique_edges(group[F], len(P))
     half = flat + m * _heights(P, F[flat])[1]
     at_boundary = flat[count[edge_of[half]] == 1]
@@ -403,10 +409,10 @@ def _flips(P, F, group, flat, tolerance):
     b = corner[(half + 2 * m) % (3 * m)]
     pairs = np.stack([half, mate], axis=1) % m
     flipped = np.stack([np.stack([p, b, d], axis=1), np.stack([b, q, d], axis=1)], axis=1)
-    # an edge b-d must not be there already, nor arise twice
+    # an edge b-d must not exist, nor be made twice
     new_edge = np.sort(group[np.stack([b, d], axis=1)], axis=1) @ [len(P), 1]
     is_new = (group[b] != group[d]) & ~np.isin(new_edge, E @ [len(P), 1])
-    # it helps if neither is flat then, or if the edge gets shorter: no endless turns
+    # accept a flip if neither triangle is then flat, or if it shortens the edge (no cycles)
     before = np.linalg.norm(P[p] - P[q], axis=1)
     after = np.linalg.norm(P[b] - P[d], axis=1)
     height = _heights(P, flipped.reshape(-1, 3))[0].reshape(-1, 2).min(axis=1)
@@ -417,7 +423,7 @@ def _flips(P, F, group, flat, tolerance):
 
 
 def _heights(P, F):
-    """Height of each triangle over its longest side, and the first corner of that side."""
+    """Height of each triangle over its longest side, and first corner of that side."""
     side = _sides(P, F)
     double_area = np.linalg.norm(triangle_normals(P, F), axis=1)
     return double_area / np.maximum(side.max(axis=1), 1e-300), side.argmax(axis=1)
@@ -430,17 +436,17 @@ def _sides(P, F):
 
 
 def _keep_components(X, T, wanted, counts):
-    """The components asked for, outwards, in the old numbering; and the mask of their vertices."""
+    """Keep the `wanted` components, oriented outwards; return X, T and the mask of vertices."""
     label = components(np.concatenate([T[:, :2], T[:, 1:]]), len(X))
     n = label.max() + 1
     area = np.bincount(label[T[:, 0]], triangle_areas(X, T), n)
     order = np.argsort(-area, kind="stable")
     share = area[order[0]] / area.sum()
     if wanted == "largest" and share < 0.5:
-        enough = int(np.searchsorted(np.cumsum(area[order]), 0.9 * area.sum())) + 1
+        n_enough = int(np.searchsorted(np.cumsum(area[order]), 0.9 * area.sum())) + 1
         raise ValueError(
             f"the largest of {n} components has {100 * share:.1f} % of the area, under half; "
-            f"say how many belong to the shape: components={enough} holds 90 %, "
+            f"say how many belong to the shape: components={n_enough} keeps 90 %, "
             f'components="all" keeps all'
         )
     keep = np.zeros(n, bool)
@@ -449,15 +455,15 @@ def _keep_components(X, T, wanted, counts):
     counts["dropped_components"] = int(n - keep.sum())
     counts["area_dropped"] = float(area[~keep].sum() / area.sum())
     T = T[keep[label[T[:, 0]]]]
-    T, n_turned = _turn_outwards(X, T, label, n)
-    counts["reoriented_triangles"] += n_turned
+    T, n_flipped = _orient_outwards(X, T, label, n)
+    counts["reoriented_triangles"] += n_flipped
     return X[keep[label]], T, keep[label]
 
 
-def _turn_outwards(X, T, label, n):
-    """Turn components so that they enclose a positive volume; say how many triangles were turned.
+def _orient_outwards(X, T, label, n):
+    """Orient components to enclose a positive volume; return T and the number of flips.
 
-    An open one is seen from the middle of its boundary, a closed one from that of its vertices.
+    The volume is measured from the mean of the boundary vertices, or of all vertices if closed.
     """
     E, _, count = unique_edges(T, len(X))
     weight = np.zeros(len(X))
@@ -471,8 +477,8 @@ def _turn_outwards(X, T, label, n):
     volume = np.bincount(component, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, n)
     area = np.bincount(component, triangle_areas(X, T), n)
     inwards = volume < np.where(closed, 0, -1e-3 * area**1.5)  # a flat open patch has no outside
-    turned = inwards[component]
-    return np.where(turned[:, None], T[:, ::-1], T), int(turned.sum())
+    flip = inwards[component]
+    return np.where(flip[:, None], T[:, ::-1], T), int(flip.sum())
 
 
 def _count_topology(T, counts):
@@ -480,48 +486,48 @@ def _count_topology(T, counts):
     boundary, ends = np.unique(E[count == 1], return_inverse=True)
     holes = int(components(ends.reshape(-1, 2), len(boundary)).max(initial=-1) + 1)
     chi = int(euler_characteristic(T, E))
-    kept = counts["components"] - counts["dropped_components"]
-    # chi = 2 - 2 genus - holes, of each component
-    counts |= {"holes": holes, "euler_characteristic": chi, "genus": (2 * kept - holes - chi) // 2}
+    n = counts["components"] - counts["dropped_components"]
+    # chi = 2 - 2 genus - holes, for each component
+    counts |= {"holes": holes, "euler_characteristic": chi, "genus": (2 * n - holes - chi) // 2}
 
 
 def _vertex_of_file(group, new, file_vertex):
-    """The vertex that each row of the file became, -1 where it was dropped.
+    """Vertex of each row of the file, -1 if it was dropped.
 
-    It is the first new vertex at a corner of the file's vertex, else of one welded to it.
+    The lowest new vertex at a corner of the row, else at a corner of a vertex welded to it.
 
     Parameters
     ----------
     group : int ndarray (p,)
-        Of each row of the file.
+        Group of each row of the file.
     new, file_vertex : int ndarray (c,)
-        Of each corner of the triangles.
+        New vertex, and row of the file, of each corner of the triangles.
     """
-    nothing = np.iinfo(np.int64).max
+    none = np.iinfo(np.int64).max
 
-    def first(key, n):
-        vertex = np.full(n, nothing)
+    def lowest(key, n):
+        vertex = np.full(n, none)
         np.minimum.at(vertex, key[new >= 0], new[new >= 0])
-        return np.where(vertex < nothing, vertex, -1)
+        return np.where(vertex < none, vertex, -1)
 
-    own = first(file_vertex, len(group))
-    welded = np.r_[first(group[file_vertex], group.max() + 1), -1]  # the last for group -1
-    return np.where(own >= 0, own, welded[group]).astype(np.int32)
+    vertex = lowest(file_vertex, len(group))
+    welded = np.r_[lowest(group[file_vertex], group.max() + 1), -1]  # the last for group -1
+    return np.where(vertex >= 0, vertex, welded[group]).astype(np.int32)
 
 
-_MOST_AROUND_EDGE = 16  # an edge with more triangles is cut: pairing takes their number squared
+_MOST_AROUND_EDGE = 16  # edges with more triangles are cut: pairing is quadratic in their number
 
 
 def _manifold_mates(edge_of, count):
-    """The mate of each half-edge ``(3 m,)`` on edges with two triangles, else -1.
+    """Mate of each half-edge ``(3 m,)`` on edges with two triangles, else -1.
 
     `edge_of` and `count` are those of :func:`s4a.geometry.mesh.unique_edges`.
     """
     order = counting_order(edge_of, len(count))
-    first = (np.cumsum(count) - count)[count == 2]
-    one, other = order[first], order[first + 1]
+    start = (np.cumsum(count) - count)[count == 2]
+    h, g = order[start], order[start + 1]
     mate = np.full(len(edge_of), -1)
-    mate[one], mate[other] = other, one
+    mate[h], mate[g] = g, h
     return mate
 
 
@@ -531,9 +537,9 @@ def _join_triangles(P, F, group, counts):
     Returns
     -------
     F : int ndarray (m, 3)
-        The triangles, some turned.
+        The triangles, some flipped.
     mate : int ndarray (3 m,)
-        Of each half-edge, -1 at boundaries and cuts.
+        Mate of each half-edge, -1 at boundaries and cuts.
     """
     _, edge_of, count = unique_edges(group[F], len(P))
     F, mate = _orient(P, F, group, _manifold_mates(edge_of, count), counts)
@@ -541,50 +547,49 @@ def _join_triangles(P, F, group, counts):
         _, edge_of, count = unique_edges(group[F], len(P))
         counts["nonmanifold_edges"] = int((count > 2).sum())
         pairs, cost = _pairs_around_edges(P, F, group, edge_of, count)
-        one, other = pairs[cheapest(cost, pairs)].T
-        mate[one], mate[other] = other, one
+        h, g = pairs[cheapest(cost, pairs)].T
+        mate[h], mate[g] = g, h
         F, mate = _orient(P, F, group, mate, counts)
     counts["cut_edges"] = int((mate < 0).sum() - (count == 1).sum())
     return F, mate
 
 
 def _pairs_around_edges(P, F, group, edge_of, count):
-    """All pairs of half-edges on each non-manifold edge, and how badly each continues the surface.
+    """All pairs of half-edges on each non-manifold edge, with the cost of joining them.
 
     Returns
     -------
     pairs : int ndarray (c, 2)
     cost : float ndarray (c,)
-        1 - cos of the bend, more for a pair that disagrees in orientation; between equal bends the
-        pair that encloses less of the inside goes first, so that solids that touch in an edge come
-        apart.
+        1 - cos of the dihedral angle, more if orientations disagree.  On a tie, the convex pair
+        is cheaper, to separate solids that touch in an edge.
     """
     order = counting_order(edge_of, len(count))
-    first = np.cumsum(count) - count
-    found = [np.empty((0, 2), np.int64)]
+    start_of_edge = np.cumsum(count) - count
+    pairs = [np.empty((0, 2), np.int64)]
     for k in range(3, _MOST_AROUND_EDGE + 1):
-        around = order[first[count == k][:, None] + np.arange(k)]  # (edges, k) half-edges
-        found += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
-    pairs = np.concatenate(found)
-    h, g = pairs.T
+        around = order[start_of_edge[count == k][:, None] + np.arange(k)]  # (edges, k) half-edges
+        pairs += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
+    pair = np.concatenate(pairs)
+    h, g = pair.T
     m = len(F)
     normal = triangle_normals(P, F)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal /= np.maximum(length, np.finfo(float).tiny)  # some have lost theirs to rounding
+    normal /= np.maximum(length, np.finfo(float).tiny)  # rounding may leave a length of zero
     start = group[F].T.ravel()
     twisted = start[h] == start[g]
     cos = np.einsum("ij,ij->i", normal[h % m], normal[g % m]) * np.where(twisted, -1, 1)
     corner = F.T.ravel()
-    towards = P[corner[(g + 2 * m) % (3 * m)]] - P[corner[h]]  # to the other one's third corner
+    towards = P[corner[(g + 2 * m) % (3 * m)]] - P[corner[h]]  # to the third corner of the mate
     convex = np.einsum("ij,ij->i", normal[h % m], towards) < 0
-    return pairs, np.round(1 - cos, 6) + 4 * twisted - 1e-7 * convex
+    return pair, np.round(1 - cos, 6) + 4 * twisted - 1e-7 * convex
 
 
 def _orient(P, F, group, mate, counts):
-    """Turn triangles so that mates run against each other, most of each patch's area as it was.
+    """Flip triangles until mates run in opposite directions, keeping most of each patch's area.
 
-    A triangle stands for two nodes, as it is and reversed; a patch whose two copies are connected
-    cannot be oriented (a Moebius strip), and is cut where the file's orientation changes.
+    Each triangle has two nodes, as it is and flipped.  A patch whose two copies are connected is
+    not orientable (a Moebius strip), and is cut where the orientation in the file changes.
     """
     m = len(F)
     h = np.flatnonzero(mate > np.arange(3 * m))
@@ -596,18 +601,18 @@ def _orient(P, F, group, mate, counts):
     t, u = h % m, g % m
     links = np.stack([np.r_[t, t + m], np.r_[u + m * twisted, u + m * ~twisted]], axis=1)
     label = components(links, 2 * m)
-    as_is, turned = label[:m], label[m:]
+    as_is, flipped = label[:m], label[m:]
     area = np.bincount(as_is, triangle_areas(P, F), label.max() + 1)
-    tie = (area[turned] == area[as_is]) & (turned < as_is)
-    flip = (area[turned] > area[as_is]) | tie
-    cut = twisted & (as_is == turned)[t]
+    tie = (area[flipped] == area[as_is]) & (flipped < as_is)
+    flip = (area[flipped] > area[as_is]) | tie
+    cut = twisted & (as_is == flipped)[t]
     mate[h[cut]] = mate[g[cut]] = -1
     counts["reoriented_triangles"] += int(flip.sum())
     return _reverse(F, mate, np.flatnonzero(flip))
 
 
 def _reverse(F, mate, t):
-    """Exchange corners 0 and 1 of triangles t: half-edge 0 stays, 1 and 2 trade places."""
+    """Exchange corners 0 and 1 of triangles t: half-edge 0 stays, 1 and 2 are exchanged."""
     m, F = len(F), F.copy()
     F[t] = F[t][:, [1, 0, 2]]
     moved = np.arange(3 * m)
@@ -618,21 +623,21 @@ def _reverse(F, mate, t):
 
 
 def _join_corners(F, mate):
-    """Vertices as the sets of corners that mates join: one for each umbrella of triangles.
+    """Vertices as sets of corners joined by mates, one for each fan of triangles.
 
-    A bow-tie or the end of a separated edge falls apart into several.
+    A bow-tie vertex, or the end of a split edge, becomes several vertices.
 
     Returns
     -------
     V : int ndarray (m, 3)
-        The triangles' corners as such vertices.
+        New vertex of each corner.
     file_vertex : int ndarray (n,)
-        The smallest file vertex of each.
+        The lowest row of the file of each vertex.
     """
     m = len(F)
     h = np.flatnonzero(mate > np.arange(3 * m))
     g = mate[h]
-    # the start of one is the end of the other
+    # the start of a half-edge is the end of its mate
     links = np.stack([np.r_[h, (h + m) % (3 * m)], np.r_[(g + m) % (3 * m), g]], axis=1)
     label = components(links, 3 * m)
     file_vertex = np.full(label.max() + 1, np.iinfo(np.int64).max)
@@ -644,31 +649,31 @@ def _join_corners(F, mate):
 
 
 def _split_double_edges(X, V, file_vertex, mate, counts):
-    """Give each of two sheets its own midpoint where they share both ends of an edge.
+    """Insert a midpoint for each of two surfaces that share both ends of an edge.
 
     Returns
     -------
     X : float ndarray (n + s, 3)
-        The midpoints appended.
+        The midpoints are appended.
     V : int ndarray (m', 3)
-        A triangle with midpoints is replaced by those around them.
+        Triangles with midpoints are subdivided.
     file_vertex : int ndarray (n + s,)
     """
     m, n = len(V), len(X)
     E, edge_of, count = unique_edges(V, n)
     start = V.T.ravel()
-    turn = np.bincount(edge_of, np.where(start < np.roll(start, -m), 1, -1))
-    double = (count > 2) | ((count == 2) & (turn != 0))
+    balance = np.bincount(edge_of, np.where(start < np.roll(start, -m), 1, -1))
+    double = (count > 2) | ((count == 2) & (balance != 0))
     half = np.flatnonzero(double[edge_of])
     if len(half) == 0:
         return X, V, file_vertex
-    sheet = np.where(mate[half] >= 0, np.minimum(mate[half], half), half)
-    sheets, middle = np.unique(sheet, return_inverse=True)
-    of_half = np.full(3 * m, -1)
-    of_half[half] = n + middle
-    M = of_half.reshape(3, m).T  # (m, 3) the midpoint of each side, or -1
-    #        r             a is there: the sides are turned until it is;
-    #      / | \           without c the triangle a-c-p is none, without b it is a-q-b
+    joined = np.where(mate[half] >= 0, np.minimum(mate[half], half), half)
+    edges, inverse = np.unique(joined, return_inverse=True)
+    midpoint = np.full(3 * m, -1)
+    midpoint[half] = n + inverse
+    M = midpoint.reshape(3, m).T  # (m, 3) the midpoint of each side, or -1
+    #        r             corners are rotated until a exists;
+    #      / | \           without c there is no triangle a-c-p, without b no a-q-b
     #    c   |   b
     #   /  \ | /  \
     #  p-----a-----q
@@ -678,18 +683,18 @@ def _split_double_edges(X, V, file_vertex, mate, counts):
     a, b, c = np.take_along_axis(M[t], turn, 1).T
     b = np.where(b < 0, r, b)
     c = np.where(c < 0, p, c)
-    parts = [(a, q, b), (a, b, r), (a, r, c), (a, c, p)]
-    fan = np.concatenate([np.stack(part, axis=1) for part in parts])
+    corners = [(a, q, b), (a, b, r), (a, r, c), (a, c, p)]
+    fan = np.concatenate([np.stack(triangle, axis=1) for triangle in corners])
     fan = fan[(fan[:, 0] != fan[:, 2]) & (fan[:, 1] != fan[:, 2])]
-    ends = E[edge_of[sheets]]
-    counts["inserted_vertices"] = len(sheets)
+    ends = E[edge_of[edges]]
+    counts["inserted_vertices"] = len(edges)
     X = np.concatenate([X, X[ends].mean(axis=1)])
     V = np.concatenate([np.delete(V, t, axis=0), fan])
     return X, V, np.r_[file_vertex, file_vertex[ends].min(axis=1)]
 
 
 def cheapest(cost: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Greedy matching: the mask of the pairs taken in order of cost, each end once.
+    """Greedy matching: mask of the pairs taken in order of cost, each end once.
 
     Parameters
     ----------
@@ -702,19 +707,21 @@ def cheapest(cost: np.ndarray, ends: np.ndarray) -> np.ndarray:
     items, ends = np.unique(ends, return_inverse=True)
     ends = ends.reshape(-1, 2)
     taken, used = np.zeros(len(cost), bool), np.zeros(len(items), bool)
-    left = np.arange(len(cost))
-    while len(left):  # all pairs at once that are the best of both their ends
+    rest = np.arange(len(cost))
+    while len(rest):  # take all pairs that are the best of both ends
         best = np.full(len(items), len(cost))
-        np.minimum.at(best, ends[left], rank[left, None])
-        win = left[(best[ends[left]] == rank[left, None]).all(axis=1)]
+        np.minimum.at(best, ends[rest], rank[rest, None])
+        win = rest[(best[ends[rest]] == rank[rest, None]).all(axis=1)]
         taken[win] = True
         used[ends[win]] = True
-        left = left[~used[ends[left]].any(axis=1)]
+        rest = rest[~used[ends[rest]].any(axis=1)]
     return taken
 
 
 def fill_holes(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Close every boundary loop of an oriented manifold by a fan around a new vertex.
+
+    The new vertex is the mean of the loop, weighted by edge length.
 
     Parameters
     ----------
@@ -724,10 +731,9 @@ def fill_holes(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     Returns
     -------
     X : float ndarray (n + h, 3)
-        A vertex for each of h loops is appended, at the mean of the loop weighted by the length of
-        its edges.
+        With a vertex for each of h loops.
     T : int ndarray (m + b, 3)
-        A triangle for each of b boundary edges is appended.
+        With a triangle for each of b boundary edges.
     nearby : int ndarray (h,)
         A vertex of each loop.
 
@@ -744,12 +750,12 @@ def fill_holes(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     E = E[~np.isin(E @ [n, 1], E[:, ::-1] @ [n, 1])]
     boundary, ends = np.unique(E, return_inverse=True)
     ends = ends.reshape(-1, 2)
-    loop = components(ends, len(boundary))
-    of, h = loop[ends[:, 0]], loop.max(initial=-1) + 1
+    label = components(ends, len(boundary))
+    loop, h = label[ends[:, 0]], label.max(initial=-1) + 1  # loop of each edge
     length = np.linalg.norm(X[E[:, 0]] - X[E[:, 1]], axis=1)
-    weight = length / np.bincount(of, length, h)[of] if len(E) else length
-    middle = np.stack([np.bincount(of, weight * X[E, i].mean(1), h) for i in range(3)], axis=1)
-    fans = np.column_stack([E[:, 1], E[:, 0], n + of])
+    weight = length / np.bincount(loop, length, h)[loop] if len(E) else length
+    centre = np.stack([np.bincount(loop, weight * X[E, i].mean(1), h) for i in range(3)], axis=1)
+    fans = np.column_stack([E[:, 1], E[:, 0], n + loop])
     nearby = np.full(h, n)
-    np.minimum.at(nearby, of, E[:, 0])
-    return np.concatenate([X, middle]), np.concatenate([T, fans]), nearby
+    np.minimum.at(nearby, loop, E[:, 0])
+    return np.concatenate([X, centre]), np.concatenate([T, fans]), nearby

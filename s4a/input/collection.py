@@ -1,4 +1,4 @@
-"""A collection of shapes (5.1, the data): every file read and cleaned, and a report on all."""
+"""Collections of shapes (5.1, the data): read and clean every file, and report on all."""
 
 import os
 from collections.abc import Iterable
@@ -49,23 +49,29 @@ def read_shape(
     Parameters
     ----------
     path : str or Path
-        See :func:`s4a.input.files.read_mesh` for the formats.
+        See :func:`s4a.read_mesh` for the formats.
     components, strict, close_holes
-        See :func:`s4a.input.clean.clean`.
-    label : int, several, or "all", optional
-        The file is a label volume, and the mesh the surface of what bears this label, see
+        See :func:`s4a.clean`.
+    label : int, list of int, or "all", optional
+        Read the file as a label volume, and return the surface of this label, see
         :func:`s4a.input.labels.read_volume`.
 
     Returns
     -------
     Dataset
-        As :func:`s4a.input.clean.clean` gives it; in the attributes also ``path``, ``format`` and,
-        where the file says so, ``coordinate_system`` and ``unit``.
+        See :func:`s4a.clean`; with the attributes ``path``, ``format`` and, if the file has them,
+        ``coordinate_system`` and ``unit``.
 
     Raises
     ------
     ValueError
-        When the file cannot be read or cleaned.
+        If the file cannot be read or cleaned.
+
+    See Also
+    --------
+    read_shapes : read a collection.
+    read_mesh : read without cleaning.
+    with_landmarks : add landmarks that guide the registration.
 
     Examples
     --------
@@ -120,29 +126,34 @@ def read_shapes(
         A folder, a glob, a file or several of these, see :func:`s4a.input.files.find_meshes`; or
         a dict of name to a file, ``(points, triangles)`` or a mesh Dataset.
     components, strict, close_holes
-        See :func:`s4a.input.clean.clean`.
+        See :func:`s4a.clean`.
     pattern : str, optional
-        Of the files found, those whose name it matches, such as ``"*_brain"``.
-    label : int, several, or "all", optional
-        The files are label volumes, see :func:`read_labels`.
+        Use only files whose name matches, such as ``"*_brain"``.
+    label : int, list of int, or "all", optional
+        Read the files as label volumes, see :func:`read_labels`.
     compare : bool
-        Whether each shape is compared with the others: unit, mean_chirality, pose, genus
+        Compare each shape with the others in unit, chirality, form and genus
         (:mod:`s4a.input.plausibility`).
     intersections : bool
-        Whether triangles that pass through others are counted then.
+        Count self-intersecting triangles in that comparison.
 
     Returns
     -------
     DataTree
-        ``/original/<shape>`` for every shape that could be used, and ``/report`` over all shapes
-        with ``status`` (ok, repaired, flagged or excluded), ``reason`` (what was found and done),
-        ``warning`` (what looks wrong and was left as it is), ``path`` and counts; the attribute
-        ``remarks`` has what concerns several shapes or none, one a line.
+        ``/original/<shape>`` for every usable shape, and ``/report`` over all shapes with
+        ``status`` (ok, repaired, flagged or excluded), ``reason`` (repairs, or why the shape is
+        excluded), ``warning`` (suspect properties, left as they are), ``path`` and counts; the
+        attribute ``remarks`` has findings about several shapes, one per line.
 
     Raises
     ------
     ValueError
-        When an option is out of range, or no shape can be used; the message has every reason.
+        If an option is out of range, or no shape can be used; the message has every reason.
+
+    See Also
+    --------
+    read_shape : read a single shape.
+    analyse : analyse a collection, of the same arguments or of the tree returned.
 
     Examples
     --------
@@ -168,45 +179,54 @@ def read_shapes(
             path = str(source) if isinstance(source, str | Path) else ""
             attrs[name] = {"status": "excluded", "reason": str(error), "path": path}
     if not meshes:
-        reasons = "; ".join(f"{name}: {said['reason']}" for name, said in attrs.items())
+        reasons = "; ".join(f"{name}: {values['reason']}" for name, values in attrs.items())
         raise ValueError(f"none of {len(attrs)} shapes can be used ({reasons})")
-    evidence = {}
+    comparisons = {}
     if compare and len(meshes) > 1:
-        evidence = examine(meshes, intersections=intersections)
-    used = {name: said for name, said in attrs.items() if said["status"] != "excluded"}
-    flags, remarks = plausibility.find_warnings(used, evidence)
+        comparisons = examine(meshes, intersections=intersections)
+    used = {name: values for name, values in attrs.items() if values["status"] != "excluded"}
+    flags, remarks = plausibility.find_warnings(used, comparisons)
     nodes = {f"/original/{name}": mesh for name, mesh in meshes.items()}
     remarks = [*remarks, *remarks_on_files(paths, pattern, volumes=volumes)]
-    nodes["/report"] = shape_report(attrs, flags, remarks, evidence)
+    nodes["/report"] = shape_report(attrs, flags, remarks, comparisons)
     return xr.DataTree.from_dict(nodes)
 
 
 def read_labels(paths: Paths, *, label: Label = "all", **options: Any) -> xr.DataTree:
-    """Surfaces of one structure of every label volume, as a segmentation marks it, cleaned.
+    """Read label volumes as a collection of surfaces, one structure of each volume.
 
-    Marching cubes between the voxels inside and those outside, smoothed without shrinking (Taubin),
-    in world coordinates: millimetres, RAS.
+    Surfaces are extracted by marching cubes, smoothed without shrinking [1]_ and cleaned.  World
+    coordinates are in millimetres, RAS.
 
     Parameters
     ----------
     paths : str, Path or list of these
         Folders, globs or files: NIfTI (.nii) or FreeSurfer (.mgh, .mgz), each also as .gz.
     label : int, str or list of int
-        The structure; several (``[1, 2]`` or ``"1,2"``) are one, ``"all"`` is whatever is not 0.
+        The structure; several labels (``[1, 2]`` or ``"1,2"``) are merged, ``"all"`` means every
+        voxel that is not 0.
     **options
-        Of :func:`read_shapes`.
+        Options of :func:`read_shapes`.
 
     Returns
     -------
     DataTree
-        As of :func:`read_shapes`.  The report says of each volume where a label reached its border
-        and was closed there, and how many components were found and dropped.
+        See :func:`read_shapes`.  The report also says which surfaces were closed at the border of
+        the volume.
 
     Raises
     ------
     ValueError
-        When scikit-image is not installed or no volume has the label; the message has every
-        reason, and the labels that were found.
+        If scikit-image is not installed or no volume has the label; the message has every reason,
+        and the labels that were found.
+
+    See Also
+    --------
+    write_label_volumes : write a structure of the template into the volumes of the shapes.
+
+    References
+    ----------
+    .. [1] G. Taubin, "A signal processing approach to fair surface design", SIGGRAPH 1995.
 
     Examples
     --------
@@ -235,15 +255,15 @@ def remarks_on_files(
     *,
     volumes: bool = False,
 ) -> list[str]:
-    """In words: the files among `paths` that are no meshes, and those whose names are too long."""
+    """Remarks on files among `paths` that are not meshes, or whose names were shortened."""
     if isinstance(paths, dict | xr.DataTree):
         return []
     what = "label volume" if volumes else "mesh"
     return [
-        f"{shown(file)} is not a {what} ({why}) and was passed over"
+        f"{shown(file)} is not a {what} ({why}) and was skipped"
         for file, why in not_meshes(paths, pattern, volumes=volumes)
     ] + [
-        f"{shown(file)} is called {name}: names of shapes have at most {LONGEST_NAME} letters"
+        f"{shown(file)} is named {name}: names of shapes have at most {LONGEST_NAME} characters"
         for file, name in find_meshes(paths, pattern, volumes=volumes)
         if was_cut(file, name)
     ]
@@ -253,30 +273,29 @@ def shape_report(
     attrs: dict[str, dict[str, Any]],
     flags: plausibility.Flags | None = None,
     remarks: Iterable[str] = (),
-    evidence: dict[str, xr.Dataset] | None = None,
+    comparisons: dict[str, xr.Dataset] | None = None,
 ) -> xr.Dataset:
     """Make the report on the shapes of a collection.
 
     Parameters
     ----------
     attrs : dict
-        Name of each shape -> ``status``, ``reason``, ``path`` and counts; where one was excluded,
-        counts are -1 in the report.
-    flags : dict of str to list of Doubt, optional
-        What looks wrong, as of :func:`s4a.input.plausibility.find_warnings`; a shape that is not
-        excluded is flagged where one of them says so.
+        Name of each shape -> ``status``, ``reason``, ``path`` and counts; counts of an excluded
+        shape are -1 in the report.
+    flags : dict of str to list of Flag, optional
+        See :func:`s4a.input.plausibility.find_warnings`; flags of excluded shapes are ignored.
     remarks : list of str
         On the collection, the most important first.
-    evidence : dict, optional
-        Name -> :func:`s4a.input.plausibility.compare`, whose counts are columns.
+    comparisons : dict, optional
+        Name -> :func:`s4a.input.plausibility.compare`, for the counts.
     """
-    evidence, flags = evidence or {}, flags or {}
+    comparisons, flags = comparisons or {}, flags or {}
     rows = []
-    for name, said in attrs.items():
-        of_shape = [] if said["status"] == "excluded" else flags.get(name, [])
-        rows.append({**said, **_flag_columns(of_shape)})
-        if name in evidence:
-            rows[-1]["self_intersections"] = evidence[name].attrs["self_intersections"]
+    for name, values in attrs.items():
+        flags_of_shape = [] if values["status"] == "excluded" else flags.get(name, [])
+        rows.append({**values, **_flag_columns(flags_of_shape)})
+        if name in comparisons:
+            rows[-1]["self_intersections"] = comparisons[name].attrs["self_intersections"]
     columns: dict[str, list[Any] | np.ndarray] = {
         key: [shown(row.get(key, "")) for row in rows] for key in TEXTS
     }
@@ -287,9 +306,9 @@ def shape_report(
 
 
 def _flag_columns(flags):
-    """What the report says of a shape's flags; the status only where they make it flagged."""
-    serious = dict.fromkeys(one.kind for one in flags if one.flagged)
-    others = dict.fromkeys(one.kind for one in flags if not one.flagged)
+    """Columns of the report for a shape's flags; ``status`` only if it is flagged."""
+    serious = dict.fromkeys(flag.kind for flag in flags if flag.flagged)
+    others = dict.fromkeys(flag.kind for flag in flags if not flag.flagged)
     columns = {
         "warning": plausibility.in_words(flags),
         "flag_kinds": " ".join(serious),
@@ -299,7 +318,7 @@ def _flag_columns(flags):
 
 
 def _sources(paths, pattern, volumes):
-    """Name to path, arrays or Dataset, in the order of the names."""
+    """Name -> path, arrays or Dataset, sorted by name."""
     if not isinstance(paths, dict):
         return dict(
             sorted((name, path) for path, name in find_meshes(paths, pattern, volumes=volumes))
@@ -309,7 +328,7 @@ def _sources(paths, pattern, volumes):
 
 
 def _cleaned(source, label, **options):
-    """A file, a Dataset or a pair of arrays, cleaned."""
+    """Read and clean a file, a Dataset or a pair of arrays."""
     if isinstance(source, str | Path):
         return read_shape(source, label=label, **options)
     if isinstance(source, xr.Dataset):

@@ -18,46 +18,50 @@ from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
 from s4a.input.labels import VOLUMES, is_volume
 from s4a.input.raw import check_there, content, regular_file, shown
 
-SUFFIXES = {suffix: name for name, known in FORMATS.items() for suffix in known.suffixes.split()}
-WRITERS = {known.suffixes.split()[0]: known.write for known in FORMATS.values() if known.write}
-LONGEST_NAME = 100  # letters of a shape's name, so that files of a study can be named after it
-OTHERS = ".json .csv .txt .md .html .png .jpg .nc .npy .annot .nii".split()  # that a glob may match
+SUFFIXES = {suffix: name for name, kind in FORMATS.items() for suffix in kind.suffixes.split()}
+WRITERS = {kind.suffixes.split()[0]: kind.write for kind in FORMATS.values() if kind.write}
+LONGEST_NAME = 100  # characters of a shape's name, as files of a study are named after it
+OTHERS = ".json .csv .txt .md .html .png .jpg .nc .npy .annot .nii".split()  # not meshes
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
 def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
-    """Points and triangles of a mesh file; the format is told by the content, not by the name.
+    """Read points and triangles of a mesh file; the format is detected from the content.
 
     Parameters
     ----------
     path : str or Path
         PLY, OBJ, OFF, STL, VTK legacy polydata, VTP, GIFTI, FreeSurfer surface, or NPZ with the
         keys V and F, vertices and faces, points and triangles, position and corner_vertex, or X and
-        T; each of them compressed by gzip too (.ply.gz), which may unpack to 1 GiB.  A regular
-        file of 2 GiB at most.  Polygons become fans of triangles.
+        T.  Files may be compressed by gzip (.ply.gz).  The limit is 2 GiB, or 1 GiB unpacked.
+        Polygons are split into triangles.
 
     Returns
     -------
     points : float64 ndarray (n, 3)
-        As in the file, non-finite ones too; those of an STL, which has no vertices, are its
-        distinct corners.
+        As in the file, including non-finite ones; for STL, the distinct corners.
     triangles : int32 ndarray (m, 3)
     attrs : dict of str
-        ``format``, and where the file says so ``coordinate_system`` (RAS or LPS) and ``unit``;
-        ``note`` when the name promises another format.
+        ``format``; ``coordinate_system`` (RAS or LPS) and ``unit`` if the file has them; ``note``
+        if the suffix is that of another format.
 
     Raises
     ------
     ValueError
-        When the file is not a mesh, ends early or contradicts itself; the message names the file.
+        If the file is not a mesh, is truncated or inconsistent; the message names the file.
+
+    See Also
+    --------
+    write_mesh : write a mesh file.
+    read_shape : read and clean a mesh file.
 
     Examples
     --------
     >>> import tempfile
     >>> from pathlib import Path
     >>> import s4a
-    >>> path = Path(tempfile.mkdtemp()) / "one.off"
+    >>> path = Path(tempfile.mkdtemp()) / "triangle.off"
     >>> s4a.write_mesh(path, [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
     >>> points, triangles, attrs = s4a.read_mesh(path)
     >>> points.shape, triangles.tolist()
@@ -69,25 +73,25 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
     try:
         data = content(path).removeprefix(b"\xef\xbb\xbf")
         if is_volume(data):
-            raise ValueError("found a volume; with a label (label=17, --label 17) it is a surface")
+            raise ValueError("found a volume; give a label (label=17, --label 17) for its surface")
         name = format_of(data)
-        with np.errstate(all="ignore"):  # nonsense in the file is refused, or left to the cleaning
+        with np.errstate(all="ignore"):  # invalid numbers are an error here or cleaned later
             points, triangles, attrs = FORMATS[name].read(data)
             points, triangles = _checked(points, triangles)
-    except Exception as error:  # whatever a file holds, it must not end the run over a collection
+    except Exception as error:  # no file may end the run over a collection
         why = shown(error) or type(error).__name__
         raise ValueError(f"{shown(path)} cannot be read as {name}: {why}") from error
     attrs = {"format": name, **attrs}
-    space = re.search(rb"SPACE=(RAS|LPS)", data[:1000])  # as 3D Slicer writes it into any header
+    space = re.search(rb"SPACE=(RAS|LPS)", data[:1000])  # 3D Slicer writes this into any header
     if space:
         attrs["coordinate_system"] = space[1].decode()
     if SUFFIXES.get(suffix_of(path), name) != name:
-        attrs["note"] = f"named {path.suffix} but holds {name}, and was read as that; rename it"
+        attrs["note"] = f"named {path.suffix} but read as {name} by its content; rename the file"
     return points, triangles, attrs
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str:
-    """What the name promises: the suffix in lower case, that before .gz where there is one.
+    """Return the suffix of a path in lower case, ignoring .gz.
 
     Examples
     --------
@@ -99,7 +103,7 @@ def suffix_of(path: str | os.PathLike[str]) -> str:
 
 
 def stem_of(path: str | os.PathLike[str]) -> str:
-    """The name without .gz and without the suffix of its format; FreeSurfer's suffixes are names.
+    """Return the name of a path without .gz and suffix; FreeSurfer's suffixes are kept.
 
     Examples
     --------
@@ -113,7 +117,7 @@ def stem_of(path: str | os.PathLike[str]) -> str:
 
 
 def _checked(points, triangles):
-    """Points as float64, triangles as int32, or ValueError."""
+    """Convert points to float64 and triangles to int32, or ValueError."""
     points, triangles = np.asarray(points, np.float64), np.asarray(triangles, np.int64)
     if points.ndim != 2 or points.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
         raise ValueError(
@@ -121,7 +125,7 @@ def _checked(points, triangles):
         )
     n, m = len(points), len(triangles)
     if n and m == 0:
-        raise ValueError(f"no faces: a surface needs triangles, found {n} points and nothing else")
+        raise ValueError(f"no faces: a surface needs triangles, found {n} points only")
     if n == 0:
         raise ValueError(f"a surface needs vertices and triangles, found 0 and {m}")
     low, high = triangles.min(), triangles.max()
@@ -136,23 +140,26 @@ def write_mesh(
     triangles: np.ndarray,
     **vertex_scalars: np.ndarray,
 ) -> None:
-    """Write a mesh in the format of the suffix.
-
-    These are .ply (binary), .obj, .off, .stl, .vtk, .vtp, .gii and .npz.
+    """Write a mesh file in the format of its suffix.
 
     Parameters
     ----------
     path : str or Path
+        Name ending in .ply (binary), .obj, .off, .stl, .vtk, .vtp, .gii or .npz.
     points : float ndarray (n, 3)
     triangles : int ndarray (m, 3)
     **vertex_scalars : float ndarray (n,)
-        Values per vertex by name; PLY, VTK, VTP, GIFTI and NPZ hold them, as float32 but for NPZ.
+        Values per vertex by name, in PLY, VTK, VTP, GIFTI (float32) and NPZ.
 
     Raises
     ------
     ValueError
-        When the suffix is another, the format holds no values or their number is not that of the
-        vertices.
+        If the suffix is unknown, the format cannot hold values, or their number is not n.
+
+    See Also
+    --------
+    read_mesh : read a mesh file.
+    write_registered : write a whole study as meshes in correspondence.
 
     Examples
     --------
@@ -161,8 +168,8 @@ def write_mesh(
     >>> import numpy as np
     >>> import s4a
     >>> folder = Path(tempfile.mkdtemp())
-    >>> s4a.write_mesh(folder / "one.ply", np.eye(3), [[0, 1, 2]], height=np.zeros(3))
-    >>> (folder / "one.ply").stat().st_size > 0
+    >>> s4a.write_mesh(folder / "triangle.ply", np.eye(3), [[0, 1, 2]], height=np.zeros(3))
+    >>> (folder / "triangle.ply").stat().st_size > 0
     True
     """
     path = Path(path)
@@ -178,7 +185,7 @@ def write_mesh(
         raise ValueError(f"a name ending in {', '.join(WRITERS)} needed, found {path.name}")
     if scalars and not FORMATS[SUFFIXES[suffix]].scalars:
         raise ValueError(
-            f"{suffix} holds no values per vertex; write .ply, .vtk, .vtp, .gii or .npz"
+            f"{suffix} cannot hold values per vertex; write .ply, .vtk, .vtp, .gii or .npz"
         )
     path.write_bytes(WRITERS[suffix](points, triangles, scalars))
 
@@ -189,40 +196,38 @@ def write_mesh(
 def find_meshes(
     paths: Paths, pattern: str | None = None, *, volumes: bool = False
 ) -> list[tuple[Path, str]]:
-    """The mesh files of a collection and a name for each.
+    """Find the mesh files of a collection and name each.
 
     Parameters
     ----------
     paths : str, Path or list of these
-        Folders (searched to any depth; what is no mesh is passed over, see :func:`not_meshes`),
-        files, or globs such as ``"scans/*/head.stl"``.
+        Folders (searched recursively; other files are skipped, see :func:`not_meshes`), files, or
+        globs such as ``"scans/*/head.stl"``.
     pattern : str, optional
-        Keep the files whose name, with or without suffix, it matches: ``"*_brain"`` picks one
-        structure of many.
+        Keep files whose name matches, with or without suffix: ``"*_brain"`` selects one structure.
     volumes : bool
-        Look for label volumes (:mod:`s4a.input.labels`) instead of meshes.
+        Find label volumes (:mod:`s4a.input.labels`) instead of meshes.
 
     Returns
     -------
     list of (Path, str)
-        Sorted by path.  The name has letters, digits, ``_`` and ``-`` only and is made of the
-        file's name; where two would be the same, of the folders too, and of the suffix, and of a
-        hash when nothing else tells them apart.  It has 100 letters at most, see :func:`slug`.
+        Path and name, sorted by path.  Names are made by :func:`slug` from the file's name; equal
+        names are made unique by the folders, then the suffix, then a hash.
 
     Raises
     ------
     ValueError
-        When a path is missing or no mesh is found.
+        If a path is missing or no mesh is found.
     """
-    found = _files(paths, volumes)
-    files = [file for file, why_not in found if not why_not]
+    files_and_reasons = _files(paths, volumes)
+    files = [file for file, why_not in files_and_reasons if not why_not]
     chosen = [file for file in files if pattern is None or _matches(file, pattern)]
     if not chosen:
         what = "label volume" if volumes else "mesh"
         where = ", ".join(map(shown, _listed(paths))) or "an empty list"
         if pattern and files:
             raise ValueError(f"no {what} of {len(files)} files matching {pattern!r} in {where}")
-        others = "".join(f"; {shown(file)} is {why_not}" for file, why_not in found[:3])
+        others = "".join(f"; {shown(file)} is {why_not}" for file, why_not in files_and_reasons[:3])
         raise ValueError(f"no {what} ({', '.join(_suffixes(volumes))}) in {where}{others}")
     return list(zip(chosen, slugs(chosen), strict=True))
 
@@ -230,14 +235,14 @@ def find_meshes(
 def not_meshes(
     paths: Paths, pattern: str | None = None, *, volumes: bool = False
 ) -> list[tuple[Path, str]]:
-    """What is named like meshes, or matched by a glob, and holds something else.
+    """Find files that are named like meshes, or match a glob, but are not meshes.
 
-    Folders that cannot be searched are among them, and links to folders, which are not followed.
+    Unreadable folders and links to folders, which are not followed, are included.
 
     Returns
     -------
     list of (Path, str)
-        Sorted by path, with what they are.
+        Path and what it is, sorted by path.
     """
     return [
         (file, why_not)
@@ -247,7 +252,7 @@ def not_meshes(
 
 
 def was_cut(file: Path, name: str) -> bool:
-    """Whether the name of a shape was made shorter than its file's."""
+    """Return whether the name of a shape was shortened from that of its file."""
     return len(name) == LONGEST_NAME and name not in _plain(str(file))
 
 
@@ -266,13 +271,14 @@ def _suffixes(volumes):
 
 
 def _files(paths, volumes=False):
-    """All files that are meant, once and sorted, each with why it is no mesh, or ""."""
-    by_place = {}
+    """All files given, once and sorted, each with the reason why it is not a mesh, or ""."""
+    reasons = {}
     for path in _listed(paths):
         for file, why_not in _expand(path, volumes):
-            place = os.path.abspath(file)
-            by_place[place] = min(by_place.get(place, (str(file), why_not)), (str(file), why_not))
-    return [(Path(file), why_not) for _, (file, why_not) in sorted(by_place.items())]
+            absolute = os.path.abspath(file)
+            new = (str(file), why_not)
+            reasons[absolute] = min(reasons.get(absolute, new), new)
+    return [(Path(file), why_not) for _, (file, why_not) in sorted(reasons.items())]
 
 
 def _matches(file, pattern):
@@ -280,15 +286,15 @@ def _matches(file, pattern):
 
 
 def _expand(path, volumes):
-    """The files that a folder, a file or a glob means, each with why it is no mesh, or ""."""
+    """Files of a folder, a path or a glob, each with the reason why it is not a mesh, or ""."""
     path = Path(os.path.expanduser(path))
     if os.path.isdir(path):
         return _search(path, volumes)
-    if os.path.lexists(path):  # named by itself, it is tried whatever it is
+    if os.path.lexists(path):  # a file that is given by name is always read
         return [(path, "")]
     matches = glob.glob(str(path), recursive=True) if glob.has_magic(str(path)) else []
     if not matches:
-        raise ValueError(f"no file, folder or match of {shown(path)}")
+        raise ValueError(f"no file or folder matches {shown(path)}")
     files = []
     for match in map(Path, matches):
         is_file = not os.path.isdir(match)
@@ -297,29 +303,30 @@ def _expand(path, volumes):
 
 
 def _search(folder, volumes):
-    """The files in a folder, to any depth, that are named like meshes, each with why it is none."""
-    unread: list[OSError] = []
-    files, others = [], []
-    for place, folders, names in os.walk(folder, onerror=unread.append):
-        inside = [Path(place, name) for name in folders if name[0] != "."]
-        meant = [Path(place, name) for name in names if name[0] != "."]
-        links = [path for path in inside if path.is_symlink()]
+    """Files named like meshes in a folder, recursively, each with why it is not one, or ""."""
+    errors: list[OSError] = []
+    files, others, suffixes = [], [], _suffixes(volumes)
+    for parent, folders, names in os.walk(folder, onerror=errors.append):
+        inner = [Path(parent, name) for name in folders if name[0] != "."]
+        visible = [Path(parent, name) for name in names if name[0] != "."]
+        links = [path for path in inner if path.is_symlink()]
         others += [(path, "a link to a folder, which is not followed") for path in links]
-        known = _suffixes(volumes)
-        files += [(path, _why_not(path, volumes)) for path in meant if suffix_of(path) in known]
-        named_so = [path for path in inside if suffix_of(path) in known and path not in links]
-        others += [(path, "a folder, and its files were searched") for path in named_so]
+        files += [
+            (path, _why_not(path, volumes)) for path in visible if suffix_of(path) in suffixes
+        ]
+        like_meshes = [path for path in inner if suffix_of(path) in suffixes and path not in links]
+        others += [(path, "a folder, and its files were searched") for path in like_meshes]
     others += [
         (Path(error.filename), f"a folder that cannot be searched: {error.strerror}")
-        for error in unread
+        for error in errors
     ]
     return files + others
 
 
 def _why_not(file, volumes):
-    """What a file is that may well lie beside the meshes of a collection; "" where it may be one.
+    """Reason why a file among the meshes of a collection is not a mesh, or "".
 
-    Two formats hold other things as well as meshes, and are looked into.
+    NPZ and GIFTI files may hold other data, and are opened.
     """
     suffix = suffix_of(file)
     if volumes:
@@ -336,15 +343,16 @@ def _why_not(file, volumes):
             data = content(file)
             if b"<GIFTI" in data and b"NIFTI_INTENT_POINTSET" not in data:
                 return "a GIFTI file without points"
-    except (ValueError, zipfile.BadZipFile):  # it will be said when it is read
+    except (ValueError, zipfile.BadZipFile):  # reading it will raise the error
         pass
     return ""
 
 
 def slug(text: str) -> str:
-    """`text` in letters, digits, ``_`` and ``-``: accents go, other letters become their code.
+    """Convert a text to letters, digits, ``_`` and ``-``.
 
-    What would have more than 100 letters is cut to 100, the last of which are a hash of `text`.
+    Accents are removed, other letters become their code.  More than 100 characters are shortened to
+    100, ending in a hash of `text`.
 
     Examples
     --------
@@ -369,50 +377,51 @@ def _digest(text):
 
 
 def check_names(names: Iterable[Any]) -> None:
-    """ValueError unless there are names, and each is one that :func:`slug` leaves as it is."""
+    """Raise ValueError unless there are names, and :func:`slug` leaves each as it is."""
     names = list(names)
     wrong = [name for name in names if not isinstance(name, str) or slug(name) != name]
     if wrong or not names:
         raise ValueError(
-            f"shapes need names of letters, digits, _ and -, at most {LONGEST_NAME} of them; "
-            f"found {wrong or 'none'}"
+            f"names of shapes need 1 to {LONGEST_NAME} letters, digits, _ or -; "
+            f"found {wrong or 'no shapes'}"
         )
 
 
 def files_named(
     folder: Path | str, names: Iterable[str], what: str, suffixes: Iterable[str], field: str = ""
 ) -> dict[str, Path]:
-    """The file of every shape that has one: in the folder, named as the shape is.
+    """Find the files in a folder that are named after shapes.
 
     Parameters
     ----------
     folder : path
     names : iterable of str
-        Of shapes.
+        Names of the shapes.
     what : str
-        What the files hold, for messages.
+        Content of the files, for messages.
     suffixes : iterable of str
-        Endings that such files have, lower case; one of ``.gz`` may follow.
+        Endings of the files, in lower case; ``.gz`` may follow.
     field : str, optional
-        Of the field, which may stand behind the shape: ``a.npy``, ``a.thickness.npy`` or, of
+        Name of a field that may follow that of the shape: ``a.npy``, ``a.thickness.npy`` or, for
         FreeSurfer, ``a.thickness``.
 
     Returns
     -------
     dict of str to Path
+        Files by shape; shapes without a file are absent.
 
     Raises
     ------
     ValueError
-        When there is no folder, no file in it is of a shape, or two are of one.
+        If there is no folder, no file is named after a shape, or two files are of one shape.
     """
     names, suffixes, folder = list(names), list(suffixes), Path(folder)
     if not folder.is_dir():
         raise ValueError(
-            f"{what}: a folder of files named as the shapes needed; found {shown(folder)}"
+            f"{what}: a folder of files named after the shapes needed; found {shown(folder)}"
         )
     behind = f".{field}" if field else ""
-    found: dict[str, Path] = {}
+    file_of: dict[str, Path] = {}
     for file in sorted(folder.iterdir()):
         plain = file.name[:-3] if file.name.lower().endswith(".gz") else file.name
         suffix = next((end for end in suffixes if plain.lower().endswith(end)), "")
@@ -420,27 +429,28 @@ def files_named(
         if not suffix and not (behind and plain.endswith(behind)):
             continue
         name = slug(plain.removesuffix(behind))
-        if name in found and name in names:
+        if name in file_of and name in names:
             raise ValueError(
-                f"{what}: one file for {name} needed: {shown(found[name])} and {shown(file)}"
+                f"{what}: one file for {name} needed; found "
+                f"{shown(file_of[name])} and {shown(file)}"
             )
-        found[name] = file
-    found = {name: found[name] for name in names if name in found}
-    if not found:
+        file_of[name] = file
+    file_of = {name: file_of[name] for name in names if name in file_of}
+    if not file_of:
         endings = ", ".join([*suffixes[:4], *filter(None, [behind])])
         raise ValueError(
-            f"{what}: no file in {shown(folder)} is named as a shape, such as {names[0]} with one "
-            f"of {endings}"
+            f"{what}: no file in {shown(folder)} is named after a shape, such as {names[0]} with "
+            f"one of {endings}"
         )
-    return found
+    return file_of
 
 
 def slugs(files: Iterable[str | os.PathLike[str]]) -> list[str]:
-    """A unique :func:`slug` for each path, also where upper and lower case are one."""
-    whole = [Path(os.path.abspath(file)) for file in files]
-    base = os.path.commonpath([file.parent for file in whole])
-    paths = [file.relative_to(base).as_posix() for file in whole]
-    level = dict.fromkeys(paths, 0)  # how much of the path a name is made of
+    """Return a unique :func:`slug` for each path, ignoring case."""
+    absolute = [Path(os.path.abspath(file)) for file in files]
+    base = os.path.commonpath([file.parent for file in absolute])
+    paths = [file.relative_to(base).as_posix() for file in absolute]
+    level = dict.fromkeys(paths, 0)  # how much of the path the name has
 
     def name(path):
         stem = Path(path).with_name(stem_of(path)).as_posix()

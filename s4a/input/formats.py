@@ -1,24 +1,22 @@
-"""Mesh formats, bytes to arrays and back (5, the data): the one file in which a format is added.
+"""Mesh formats (5, the data): bytes to arrays and back.
 
 How to add a format:
 
-1. Write ``_read_x(data)``: from all bytes of a file to ``points, triangles, attrs``. Whatever is
-   wrong is a ValueError that says what was expected and what was found; ask for memory only after
-   the file turned out long enough for its counts (:func:`_need`, :mod:`s4a.input.raw`). Shapes
-   and indices are checked, and the name of the file is put in front, by
-   :func:`s4a.input.files.read_mesh`; polygons become triangles by :func:`s4a.input.formats.fans`.
-2. To write it too, write ``_x_bytes(X, T, scalars)``.
-3. Enter both in :data:`FORMATS` at the end of this file, with the suffixes and with the pattern
-   that the first bytes match.
-4. Enter a whole file in ``seeds`` of ``tests/fuzz.py``, where it is damaged in thousands of ways.
+1. Write ``_read_x(data)``: from all bytes of a file to ``points, triangles, attrs``.  Raise
+   ValueError, with what was expected and found, for invalid data, and allocate memory only if the
+   file is long enough for its counts (:func:`_need`, :mod:`s4a.input.raw`).
+   :func:`s4a.input.files.read_mesh` checks shapes and indices and adds the name of the file;
+   :func:`s4a.input.formats.fans` converts polygons to triangles.
+2. To write the format too, write ``_x_bytes(X, T, scalars)``.
+3. Add both to :data:`FORMATS` at the end of this file, with suffixes and signature.
+4. Add a valid file to ``seeds`` of ``tests/fuzz.py``, which damages it in thousands of ways.
 
-Who parses what: this file parses everything itself, nibabel writes GIFTI.  Measured on the whole
-and on 400 damaged files of each format of ``tests/fuzz.py``: trimesh 5.2 reads 41 damaged PLY, 44
-OBJ and 29 OFF files as whole ones that are refused here, gives an STL three vertices a triangle
-and knows neither GIFTI, VTK nor VTP; meshio 5.3 reads 28 PLY, 13 OFF and 5 STL files so, hangs on
-some, refuses OBJ with unused texture coordinates and ends the process on VTK's polygonal data.  Of
-a torus of 100,000 vertices PLY takes 12 ms here, 40 in trimesh and 57 in meshio; OBJ 0.5, 0.3 and
-0.7 s; OFF 0.4, 0.8 and 0.2 s.  (GIFTI by nibabel was not measured.)
+Everything is parsed here; nibabel writes GIFTI.  Measured on 400 damaged files of each format of
+``tests/fuzz.py``: trimesh 5.2 reads 41 damaged PLY, 44 OBJ and 29 OFF files without an error, and
+meshio 5.3 28 PLY, 13 OFF and 5 STL files; all are errors here.  trimesh has no GIFTI, VTK and VTP,
+and gives an STL three vertices per triangle; meshio hangs on some files.  Reading a torus of
+100,000 vertices takes here, in trimesh and in meshio: PLY 12, 40 and 57 ms, OBJ 0.5, 0.3 and 0.7 s,
+OFF 0.4, 0.8 and 0.2 s.
 """
 
 import base64
@@ -44,14 +42,14 @@ _COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"
 
 
 def fans(corners: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Triangles ``(m, 3)`` of polygons whose corners stand one after the other.
+    """Triangulate polygons, given by their concatenated corners, into ``(m, 3)``.
 
     Parameters
     ----------
     corners : int ndarray (c,)
     offsets : int ndarray (p + 1,)
-        Polygon i has the corners from ``offsets[i]`` to ``offsets[i + 1]``; those with fewer than
-        three have no triangle.
+        Polygon i has the corners ``offsets[i]`` to ``offsets[i + 1]``; fewer than three give no
+        triangle.
 
     Examples
     --------
@@ -60,12 +58,12 @@ def fans(corners: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     >>> fans(np.array([0, 1, 2, 4, 5, 6, 7]), np.array([0, 3, 7])).tolist()
     [[0, 1, 2], [4, 5, 6], [4, 6, 7]]
     """
-    # 3---2   the first corner with each side away from it
+    # 3---2   the first corner and each opposite side
     # | / |
     # 0---1
-    falls = (offsets[1:] < offsets[:-1]).any()  # looked for here, as differences may overflow
-    if falls or (len(offsets) and (offsets[0] < 0 or offsets[-1] > len(corners))):
-        raise ValueError(f"polygons of {offsets[-1]} corners promised, found {len(corners)}")
+    decreasing = (offsets[1:] < offsets[:-1]).any()  # not by differences, which may overflow
+    if decreasing or (len(offsets) and (offsets[0] < 0 or offsets[-1] > len(corners))):
+        raise ValueError(f"polygons of {offsets[-1]} corners expected, found {len(corners)}")
     count = np.maximum(np.diff(offsets) - 2, 0)  # triangles of each polygon
     first = np.repeat(offsets[:-1], count)
     step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
@@ -73,11 +71,11 @@ def fans(corners: np.ndarray, offsets: np.ndarray) -> np.ndarray:
 
 
 def _number_type(name, order):
-    """The dtype that an XML file names: Float32, or NIFTI_TYPE_UINT8; order is ``<`` or ``>``."""
-    known = re.fullmatch(r"(?:NIFTI_TYPE_)?(u?int(8|16|32|64)|float(32|64))", name or "", re.I)
-    if not known:
+    """Dtype of a name in XML, as Float32 or NIFTI_TYPE_UINT8; order is ``<`` or ``>``."""
+    match = re.fullmatch(r"(?:NIFTI_TYPE_)?(u?int(8|16|32|64)|float(32|64))", name or "", re.I)
+    if not match:
         raise ValueError(f"integers or floats expected, found {str(name)[:40]}")
-    return np.dtype(order + np.dtype(known[1].lower()).str[1:])
+    return np.dtype(order + np.dtype(match[1].lower()).str[1:])
 
 
 # legacy files
@@ -115,7 +113,7 @@ def _parse_vtk(data):
 
 
 class _Legacy:
-    """The bytes of a legacy file and the place up to which they are read."""
+    """The bytes of a legacy file and the position of the reader."""
 
     def __init__(self, data):
         head = re.match(rb"[^\n]*\n[^\n]*\n\s*(ASCII|BINARY)\s*\n", data, re.I)
@@ -124,24 +122,24 @@ class _Legacy:
         self.data, self.at, self.binary = data, head.end(), head[1].upper() == b"BINARY"
 
     def line(self):
-        """Words of the next line that is not empty; none at the end."""
+        """Words of the next line that is not empty; an empty list at the end."""
         line = next(re.compile(rb"\s*([^\n]*)").finditer(self.data, self.at))
         self.at = min(line.end() + 1, len(self.data))
         return line[1].split()
 
     def values(self, count, type_name):
-        """The next numbers."""
+        """Read the next numbers."""
         dtype = np.dtype(">" + _LEGACY_TYPES[type_name.decode().lower()])
-        room = len(self.data) - self.at
-        if count < 0 or count * (dtype.itemsize if self.binary else 2) > room + 1:
+        n_bytes = len(self.data) - self.at
+        if count < 0 or count * (dtype.itemsize if self.binary else 2) > n_bytes + 1:
             raise ValueError(
-                f"expected {count} values of type {dtype.name}, found {room} bytes: "
+                f"expected {count} values of type {dtype.name}, found {n_bytes} bytes: "
                 "the file is cut short"
             )
         if self.binary:
             start, self.at = self.at, self.at + count * dtype.itemsize
             return np.frombuffer(self.data, dtype, count, start)
-        # to split all the rest for each of many short arrays would take the square of the size
+        # splitting all the rest for each array would be quadratic in the size of the file
         end = min(self.at + 64 * count + 1000, len(self.data))
         words = self.data[self.at : end].split(None, count)
         if len(words) <= count:
@@ -153,7 +151,7 @@ class _Legacy:
         return np.array(words[:count], dtype.newbyteorder("="))
 
     def polygons(self, n, size):
-        """Triangles of a section: each cell's count and corners, or offsets and corners (5.1)."""
+        """Triangles of a section: count and corners of each cell, or offsets and corners (5.1)."""
         before = self.at
         words = self.line()
         if words and words[0].upper() == b"OFFSETS":
@@ -163,11 +161,11 @@ class _Legacy:
         self.at = before
         values = self.values(size, b"int").astype(np.int64)
         is_count = np.zeros(size, bool)
-        is_count[_count_places(values, n)] = True
+        is_count[_count_positions(values, n)] = True
         return fans(values[~is_count], np.r_[0, np.cumsum(values[is_count])])
 
     def skip_fields(self, count):
-        """Over arrays that stand before the points."""
+        """Skip arrays that come before the points."""
         for _ in range(count):
             _, width, rows, type_name = self.line()
             n = int(width) * int(rows)
@@ -183,26 +181,26 @@ class _Legacy:
                     self.line()
 
 
-def _count_places(values, n):
-    """Where the counts of n cells stand among `values` (count, corners, count, corners, ...)."""
+def _count_positions(values, n):
+    """Positions of the counts of n cells in `values` (count, corners, count, corners, ...)."""
     width = len(values) // n if n > 0 else 0
     if width and len(values) == n * width and (values[::width] == width - 1).all():
-        return np.arange(0, len(values), width)  # all cells have the same
-    places, at = [], 0
+        return np.arange(0, len(values), width)  # all cells have the same number of corners
+    positions, at = [], 0
     for _ in range(n):
         if at >= len(values) or values[at] < 0:
-            raise ValueError(f"expected {n} polygons, found {len(places)}")
-        places.append(at)
+            raise ValueError(f"expected {n} polygons, found {len(positions)}")
+        positions.append(at)
         at += int(values[at]) + 1
     if at != len(values):
         raise ValueError(f"expected {len(values)} values for {n} polygons, found {at}")
-    return np.array(places, np.int64)
+    return np.array(positions, np.int64)
 
 
 def vtk_bytes(
     X: np.ndarray, T: np.ndarray, scalars: dict[str, np.ndarray], title: str = "surface"
 ) -> bytes:
-    """A binary legacy file; 3D Slicer takes ``SPACE=RAS`` or ``SPACE=LPS`` from its title."""
+    """Make a binary legacy file; 3D Slicer reads ``SPACE=RAS`` or ``SPACE=LPS`` in its title."""
     cells = np.column_stack([np.full(len(T), 3), T]).astype(">i4")
     parts = [
         b"# vtk DataFile Version 3.0\n%b\nBINARY\nDATASET POLYDATA\n" % title.encode("ascii"),
@@ -222,14 +220,14 @@ def vtk_bytes(
 
 
 def vtp_bytes(X: np.ndarray, T: np.ndarray, arrays: dict[str, np.ndarray]) -> bytes:
-    """An XML file whose arrays stand in base64.
+    """Make an XML file with arrays in base64.
 
     Parameters
     ----------
     X : float ndarray (n, 3)
     T : int ndarray (m, 3)
     arrays : dict of str to float ndarray (n,) or (n, c)
-        Values, or vectors, of the points by name; kept as float32.
+        Values, or vectors, of the points by name; stored as float32.
     """
     fields = "".join(
         _data_array(name, np.asarray(values, "<f4")) for name, values in arrays.items()
@@ -278,14 +276,14 @@ def _parse_vtp(data):
 
 
 class _Xml:
-    """An XML file, with what it says of all of its arrays."""
+    """An XML file, with the encoding of its arrays."""
 
     def __init__(self, data):
         appended = re.search(rb"<AppendedData([^<>]{0,400})>\s{0,99}_", data)
         self.appended: bytes | memoryview = b""
         self.appended_is_base64 = False
-        self.limit = limit_of(len(data))  # bytes that its arrays may still have
-        if appended:  # raw bytes are no XML
+        self.limit = limit_of(len(data))  # bytes left for its arrays
+        if appended:  # raw bytes are not XML
             self.appended_is_base64 = b"raw" not in appended[1]
             self.appended = memoryview(data)[appended.end() :]
             data = data[: appended.start()] + b"</VTKFile>"
@@ -295,12 +293,12 @@ class _Xml:
                 f"PolyData expected, found {self.root.get('type')}; save the surface as polydata"
             )
         self.order = ">" if self.root.get("byte_order") == "BigEndian" else "<"
-        wide = self.root.get("header_type") == "UInt64"
-        self.size_type = np.dtype(self.order + ("u8" if wide else "u4"))
+        is_64_bit = self.root.get("header_type") == "UInt64"
+        self.size_type = np.dtype(self.order + ("u8" if is_64_bit else "u4"))
         self.compressor = self.root.get("compressor")
 
     def values(self, node):
-        """The numbers of a DataArray."""
+        """Read the numbers of a DataArray."""
         dtype, text = _number_type(node.get("type"), self.order), node.text or ""
         if node.get("format") == "ascii":
             return np.array(text.split(), dtype)
@@ -309,11 +307,11 @@ class _Xml:
             raw = self._unpack(self.appended[start:], self.appended_is_base64)
         else:
             raw = self._unpack(text.strip().encode(), True)
-        self.limit -= len(raw)  # many arrays may name one place
+        self.limit -= len(raw)  # many arrays may refer to the same bytes
         return np.frombuffer(raw, dtype)
 
     def _unpack(self, data, is_base64):
-        """The bytes of one array: sizes stand first, then the array or its compressed blocks."""
+        """Bytes of one array: sizes come first, then the array or its compressed blocks."""
         w = self.size_type.itemsize
         if not self.compressor:
             length = int(np.frombuffer(_take(data, 0, w, is_base64), self.size_type)[0])
@@ -324,11 +322,11 @@ class _Xml:
             return _take(data, w, length, is_base64)
         if self.compressor not in _COMPRESSORS:
             raise ValueError(f"{' or '.join(_COMPRESSORS)} expected, found {self.compressor}")
-        # number of blocks, size of a block, size of the last one, compressed size of each
+        # number of blocks, size of a block, size of the last block, compressed size of each
         blocks = int(np.frombuffer(_take(data, 0, w, is_base64), self.size_type)[0])
         sizes = np.frombuffer(_take(data, 3 * w, blocks * w, is_base64), self.size_type).tolist()
         start = (3 + blocks) * w
-        if is_base64:  # sizes and blocks are encoded apart
+        if is_base64:  # sizes and blocks are encoded separately
             data, start = data[_base64_length(start) :], 0
         body = _take(data, start, sum(sizes), is_base64)
         parts, at, limit = [], 0, self.limit
@@ -340,12 +338,12 @@ class _Xml:
 
 
 def _base64_length(length):
-    """Characters that encode so many bytes."""
+    """Number of characters that encode so many bytes."""
     return 4 * -(-length // 3)
 
 
 def _take(data, start, length, is_base64):
-    """Bytes start .. start + length of what is encoded from the beginning of `data`."""
+    """Decode bytes start .. start + length, encoded from the beginning of `data`."""
     end = start + length
     raw = base64.b64decode(data[: _base64_length(end)]) if is_base64 else data[:end]
     if len(raw) < end:
@@ -357,26 +355,26 @@ def _take(data, start, length, is_base64):
 
 
 Surface = tuple[np.ndarray, np.ndarray, dict[str, str]]  # points, triangles, attributes
-_BRAIN = {"coordinate_system": "RAS", "unit": "mm"}  # what GIFTI and FreeSurfer promise
+_BRAIN = {"coordinate_system": "RAS", "unit": "mm"}  # of GIFTI and FreeSurfer
 
 
 @dataclass(frozen=True)
 class _Format:
-    """How a format is named, told, read and written.
+    """Suffixes, detection, reader and writer of a format.
 
     Parameters
     ----------
     suffixes : str
-        In lower case, separated by spaces; the first is the one that is written.
+        In lower case, separated by spaces; the first is used for writing.
     signature : bytes
-        Regular expression for the first bytes, white space left out; empty where bytes further on
-        tell, see :func:`format_of`.
+        Regular expression for the first bytes after white space; empty if later bytes decide, see
+        :func:`format_of`.
     read : callable
-        Bytes to :data:`Surface`.
+        Function of bytes that returns a :data:`Surface`.
     write : callable, optional
-        X ``(n, 3)``, T ``(m, 3)`` and a dict of values per vertex to bytes.
+        Function of X ``(n, 3)``, T ``(m, 3)`` and a dict of values per vertex that returns bytes.
     scalars : bool
-        Whether it holds values per vertex.
+        The format can hold values per vertex.
     """
 
     suffixes: str
@@ -387,22 +385,22 @@ class _Format:
 
 
 def format_of(data: bytes) -> str:
-    """Name of the format that the content shows, a key of :data:`FORMATS`.
+    """Detect the format of a file's content, a key of :data:`FORMATS`.
 
     Raises
     ------
     ValueError
-        When it shows none.
+        If the format is unknown.
 
     Examples
     --------
     >>> from s4a.input.formats import format_of
-    >>> format_of(b"OFF 3 1 0"), format_of(b"# made by hand\\nv 0 0 0")
+    >>> format_of(b"OFF 3 1 0"), format_of(b"# a comment\\nv 0 0 0")
     ('OFF', 'OBJ')
     """
     head = data[:4096].lstrip()
-    for name, known in FORMATS.items():
-        if known.signature and re.match(known.signature, head, re.DOTALL):
+    for name, kind in FORMATS.items():
+        if kind.signature and re.match(kind.signature, head, re.DOTALL):
             return name
     if len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
         return "STL"
@@ -412,21 +410,21 @@ def format_of(data: bytes) -> str:
         return "OBJ"
     if b"\0" in head and len(data) >= 84:
         return "STL"
-    what = f"{len(data)} bytes" + " of something else" * bool(data)
+    what = f"{len(data)} bytes" + " of an unknown format" * bool(data)
     raise ValueError(f"one of {', '.join(FORMATS)} expected, found {what}")
 
 
-def _whole(values):
+def _integers(values):
     """Indices as integers; those of an ascii PLY are floats."""
     if values.dtype.kind != "f":
         return values.astype(np.int64)
     if not (np.abs(values) < 2**53).all():
-        raise ValueError("face indices are no numbers, or far too large")
-    whole = values.astype(np.int64)
-    if (whole != values).any():
-        wrong = values[whole != values][0]
-        raise ValueError(f"whole numbers expected as face indices, found {wrong}")
-    return whole
+        raise ValueError("face indices are not numbers, or far too large")
+    integers = values.astype(np.int64)
+    if (integers != values).any():
+        wrong = values[integers != values][0]
+        raise ValueError(f"integers expected as face indices, found {wrong}")
+    return integers
 
 
 def _need(expected, found, what):
@@ -448,13 +446,13 @@ _PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">
 
 
 def _ply_tables(data):
-    """The columns of the elements up to vertices and faces."""
+    """Columns of the elements up to vertices and faces."""
     end = re.search(rb"\bend_header[ \t]*\r?\n", data)
     if not end:
         raise ValueError("the header has no end_header")
     kind, elements = _ply_header(data[: end.start()].decode("latin-1"))
     body = data[end.end() :]
-    if kind == "ascii":  # its numbers become eight bytes each, so that one reader does for all
+    if kind == "ascii":  # convert numbers to eight bytes each, for the binary reader
         body = np.array(body.split(), np.float64).tobytes()
     at, table = 0, {}
     for name, count, properties in elements:
@@ -465,12 +463,12 @@ def _ply_tables(data):
 
 
 def ply_properties(data: bytes) -> dict[str, np.ndarray]:
-    """The numbers that a PLY file has for its vertices, by name.
+    """Return the vertex properties of a PLY file by name.
 
     Raises
     ------
     ValueError
-        When it is cut short, or is no PLY file.
+        If the file is truncated or not a PLY file.
     """
     return _ply_tables(data).get("vertex", {})
 
@@ -489,9 +487,9 @@ def _read_ply(data):
 
 
 def _ply_header(text):
-    """The kind of file, and its elements: (name, count, [(property, types)]).
+    """Encoding and elements, (name, count, [(property, types)]), of a header.
 
-    A property has one type; a list has two, of its length and of its values.
+    A property has one type; a list has two, for its length and its values.
     """
     kind, elements = None, []
     for words in map(str.split, text.splitlines()):
@@ -504,12 +502,12 @@ def _ply_header(text):
             if not elements or not all(types):
                 line = " ".join(words)[:80]
                 raise ValueError(
-                    f"properties of elements, of the types of PLY, expected, found {line!r}"
+                    f"a property of an element, of a PLY type, expected, found {line!r}"
                 )
             elements[-1][2].append((words[-1], types))
     if kind not in _PLY_ORDERS:
-        known = ", ".join(_PLY_ORDERS)
-        raise ValueError(f"one of the formats {known} expected in the header, found {kind}")
+        orders = ", ".join(_PLY_ORDERS)
+        raise ValueError(f"one of the formats {orders} expected in the header, found {kind}")
     for _, _, properties in elements:
         for _, types in properties:
             types[:] = [
@@ -519,10 +517,10 @@ def _ply_header(text):
 
 
 def _ply_rows(body, at, name, count, properties):
-    """The columns of an element, and where the next begins.
+    """Columns of an element, and the start of the next.
 
-    The list of a face's corners is given as triangles, other lists are left out; where the rows
-    differ in length, so are the numbers beside.
+    The lists of face corners are converted to triangles; other lists are skipped.  If rows differ
+    in length, their other properties are skipped too.
     """
     least = sum(types[0].itemsize for _, types in properties)
     _need(count, (len(body) - at) // max(least, 1), f"rows of {name}")
@@ -538,14 +536,14 @@ def _ply_rows(body, at, name, count, properties):
             columns = {key: rows[key] for key, types in properties if len(types) == 1}
             for key in lists:
                 if key.startswith("vertex_ind"):
-                    corners = _whole(rows[key]).ravel()
+                    corners = _integers(rows[key]).ravel()
                     columns[key] = fans(corners, np.arange(count + 1) * lists[key])
             return columns, at + count * stride
     return _ply_mixed_rows(body, at, name, count, properties)
 
 
 def _ply_row(body, at, properties):
-    """(name, type, begin, length or None) of all in the row at `at`, None if cut; and its end."""
+    """(name, type, begin, length or None) of each part of a row, None if truncated; and its end."""
     parts: list[Any] = []
     for key, types in properties:
         begin, at = at, at + types[0].itemsize
@@ -563,7 +561,7 @@ def _ply_row(body, at, properties):
 
 
 def _ply_mixed_rows(body, at, name, count, properties):
-    """Rows of different length, one after the other: the triangles of the list of corners."""
+    """Triangles of the lists of corners, from rows of different length."""
     wanted = next((key for key, _ in properties if key.startswith("vertex_ind")), None)
     corners, sizes = [], []
     for row in range(count):
@@ -576,31 +574,31 @@ def _ply_mixed_rows(body, at, name, count, properties):
                 sizes.append(length)
     if wanted is None:
         return {}, at
-    return {wanted: fans(_whole(np.concatenate(corners)), np.cumsum([0, *sizes]))}, at
+    return {wanted: fans(_integers(np.concatenate(corners)), np.cumsum([0, *sizes]))}, at
 
 
 # OBJ, OFF, STL
 
 
 def _read_obj(data):
-    text = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")  # lines that go on
-    places, indices, sizes, n_before = [], [], [], []
+    text = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")  # continued lines
+    vertices, indices, sizes, n_before = [], [], [], []
     for line in text.splitlines():
         words = line.split()
         if words[:1] == [b"v"]:
-            places.append(words[1:4])
+            vertices.append(words[1:4])
         elif words[:1] == [b"f"]:
             indices += [word.partition(b"/")[0] for word in words[1:]]
             sizes.append(len(words) - 1)
-            n_before.append(len(places))
-    points = np.array(places, np.float64)
+            n_before.append(len(vertices))
+    points = np.array(vertices, np.float64)
     short = sum(size < 3 for size in sizes)
     if short:
         raise ValueError(f"faces of 3 corners or more expected, found {short} with fewer")
     corners = np.array(indices, np.int64)
     if (corners == 0).any():
         raise ValueError("face indices from 1, or from -1 backwards, expected; found 0")
-    # -1 is the last of the vertices that stand before the face
+    # -1 is the last vertex before the face
     corners += np.where(corners > 0, -1, np.repeat(np.array(n_before, np.int64), sizes))
     return points, fans(corners, np.cumsum([0, *sizes])), {}
 
@@ -629,33 +627,33 @@ _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("att
 
 
 def _read_stl(data):
-    """The distinct corners in order of appearance, and triangles: STL has no shared vertices."""
+    """Distinct corners in order of appearance, and triangles: STL has no shared vertices."""
     count = int.from_bytes(data[80:84], "little")
     starts_as_ascii = re.match(rb"\s*solid\b", data, re.I) and b"\0" not in data[:1000]
     if starts_as_ascii and len(data) != 84 + 50 * count:
-        found = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.I)
-        facets = len(re.findall(rb"\bfacet\b", data, re.I))
-        _need(3 * facets, len(found), "vertices of facets")
+        vertices = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.I)
+        n_facets = len(re.findall(rb"\bfacet\b", data, re.I))
+        _need(3 * n_facets, len(vertices), "vertices of facets")
         _need(1, len(re.findall(rb"\bendsolid\b", data, re.I)), "endsolid")
-        corners = np.array(found, np.float64)
+        corners = np.array(vertices, np.float64)
     else:
         _need(count, (len(data) - 84) // 50, "triangles")
         corners = np.frombuffer(data, _STL_TRIANGLE, count, 84)["corner"].reshape(-1, 3)
-    first, place = equal_rows(corners)
+    first, group = equal_rows(corners)
     rank = np.argsort(np.argsort(first))
-    return corners[np.sort(first)], rank[place].reshape(-1, 3), {}
+    return corners[np.sort(first)], rank[group].reshape(-1, 3), {}
 
 
 # containers of arrays
 
 
 def gifti_arrays(data: bytes) -> list[tuple[str, np.ndarray]]:
-    """The arrays of a GIFTI file, surfaces and labels of brains, and what each is for.
+    """Return the intent and the values of each array of a GIFTI file.
 
     Raises
     ------
     ValueError
-        When an array is cut short, unpacks to too much, or lies in another file.
+        If an array is truncated, too large, or in another file.
     """
     root, arrays, total = xml(data), [], 0
     if root.tag != "GIFTI":
@@ -664,9 +662,9 @@ def gifti_arrays(data: bytes) -> list[tuple[str, np.ndarray]]:
         values = _gifti_values(node, limit_of(len(data)) - total)
         total += values.nbytes
         arrays.append((node.get("Intent", "").removeprefix("NIFTI_INTENT_"), values))
-    promised = root.get("NumberOfDataArrays")
-    if promised is not None and promised.strip() != str(len(arrays)):
-        raise ValueError(f"expected {promised[:40]} arrays, found {len(arrays)}")
+    expected = root.get("NumberOfDataArrays")
+    if expected is not None and expected.strip() != str(len(arrays)):
+        raise ValueError(f"expected {expected[:40]} arrays, found {len(arrays)}")
     return arrays
 
 
@@ -674,9 +672,9 @@ def _gifti_values(node, limit):
     order = ">" if node.get("Endian") == "BigEndian" else "<"
     dtype = _number_type(node.get("DataType"), order)
     shape = tuple(int(node.get(f"Dim{i}")) for i in range(6) if node.get(f"Dim{i}") is not None)
-    promised = node.get("Dimensionality")
-    if str(len(shape)) != promised or not shape or min(shape) < 0:
-        raise ValueError(f"{promised} dimensions expected, found the sizes {shape}")
+    expected = node.get("Dimensionality")
+    if str(len(shape)) != expected or not shape or min(shape) < 0:
+        raise ValueError(f"{expected} dimensions expected, found the sizes {shape}")
     text, encoding = node.findtext("Data") or "", node.get("Encoding")
     if encoding == "ASCII":
         values = np.array(text.split(), dtype)
@@ -705,11 +703,11 @@ def _read_gifti(data):
             "one set of points and one of triangles expected, "
             f"found {len(points)} and {len(triangles)}"
         )
-    return points[0], _whole(triangles[0]), _BRAIN
+    return points[0], _integers(triangles[0]), _BRAIN
 
 
 def _read_freesurfer(data):
-    start = data.index(b"\n\n") + 2  # after two lines that say who made it
+    start = data.index(b"\n\n") + 2  # after two lines of comments
     n, m = (int(k) for k in np.frombuffer(data, ">i4", 2, start))
     _need(12 * (n + m), len(data) - start - 8, "bytes of vertices and triangles")
     points = np.frombuffer(data, ">f4", 3 * n, start + 8).reshape(n, 3)
@@ -772,7 +770,7 @@ def _stl_bytes(X, T, _):
 
 
 def _gifti_bytes(X, T, scalars):
-    from nibabel.gifti import gifti  # here, as nothing else needs it
+    from nibabel.gifti import gifti  # imported here only
 
     arrays = [("POINTSET", X.astype(np.float32), {}), ("TRIANGLE", T, {})]
     for name, values in scalars.items():

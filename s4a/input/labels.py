@@ -1,8 +1,7 @@
-"""Surfaces from label volumes (5.1, the data): what a segmentation marks, as a mesh in millimetres.
+"""Surfaces of label volumes (5.1, the data): segmented structures as meshes in millimetres.
 
-Between the voxels inside and those outside lies a surface (marching cubes), whose steps of one
-voxel are smoothed without shrinking it (Taubin, "A signal processing approach to fair surface
-design", 1995).
+The surface is extracted by marching cubes and smoothed without shrinking (Taubin, "A signal
+processing approach to fair surface design", 1995).
 """
 
 import io
@@ -20,66 +19,65 @@ from s4a.options import check_label
 VOLUMES = {".nii": "NIfTI", ".mgz": "MGH", ".mgh": "MGH"}
 Label = int | str | Iterable[int] | None
 ITERATIONS = 20  # of smoothing
-_UNPACKED = 2**29  # bytes of a volume that are never refused: labels compress well
-SHRINK, GROW = 0.5, -0.51  # steps of a round: lambda and mu of Taubin
+_UNPACKED = 2**29  # unpacked bytes that are always accepted: labels compress well
+SHRINK, GROW = 0.5, -0.51  # steps of an iteration: lambda and mu of Taubin
 MILLIMETRES = {"mm": 1.0, "unknown": 1.0, "meter": 1000.0, "micron": 0.001}
 _MOST_REPORTED = 30  # labels that an error lists
 
 
 def is_volume(data: bytes) -> bool:
-    """Whether the first bytes of a file are those of a NIfTI or MGH volume."""
+    """Return whether data start as a NIfTI or MGH volume."""
     return data[344:348] in (b"n+1\0", b"ni1\0") or data[:4] == b"\0\0\0\1"
 
 
 def read_volume(
     path: str | os.PathLike[str], label: Label, *, iterations: int = ITERATIONS
 ) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
-    """The surface of what a label volume marks, in its world coordinates.
+    """Extract the surface of a label in world coordinates.
 
     Parameters
     ----------
     path : str or Path
-        NIfTI (.nii) or FreeSurfer (.mgh, .mgz), each also as .gz: whole numbers in three
-        dimensions.
-    label : int, several, or "all"
-        Several are one structure, "all" is whatever is not 0.
+        NIfTI (.nii) or FreeSurfer (.mgh, .mgz), optionally as .gz: integers in three dimensions.
+    label : int, list of int, or "all"
+        Several labels are merged, "all" means every voxel that is not 0.
     iterations : int
-        Of smoothing; 0 leaves the steps of the voxels.
+        Smoothing iterations; 0 keeps the steps of the voxels.
 
     Returns
     -------
     points : float64 ndarray (n, 3)
-        In millimetres: to the right, to the front and up (RAS), where the file says how it lies.
+        In millimetres, RAS if the file has an orientation.
     triangles : int32 ndarray (m, 3)
         Counter-clockwise seen from outside.
     attrs : dict of str
-        ``format``, ``unit``, ``coordinate_system``, ``label``, and ``note`` when the volume does
-        not say how it lies, or what is marked reaches its border, where it is closed.
+        ``format``, ``unit``, ``coordinate_system``, ``label``, and ``note`` if the volume has no
+        orientation, or the surface was closed at its border.
 
     Raises
     ------
     ValueError
-        When the file is no such volume, or marks nothing with one of these labels; the message has
-        the file, and the labels that are there.
+        If the file is not a label volume or has none of these labels; the message has the file and
+        the labels found.
     """
     path = Path(path)
     check_there(path)
-    known = check_label(label)
+    checked = check_label(label)
     with reading(path, "a label volume"):
         values, affine, attrs = _volume(content(path, _UNPACKED))
-        points, triangles, at_border = _boundary(_marked(values, known))
+        points, triangles, at_border = _boundary(_marked(values, checked))
     points = points @ affine[:3, :3].T + affine[:3, 3]
     if np.linalg.det(affine[:3, :3]) < 0:
         triangles = triangles[:, ::-1]
-    attrs |= {"label": str(known), "unit": "mm"}
+    attrs |= {"label": str(checked), "unit": "mm"}
     if at_border:
-        closed = "what is marked reaches the border of the volume, where it was closed"
+        closed = "the structure reaches the border of the volume, and was closed there"
         attrs["note"] = "; ".join(filter(None, [attrs.get("note"), closed]))
     return smoothed(points, triangles, iterations), np.ascontiguousarray(triangles), attrs
 
 
 def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarray, np.ndarray]:
-    """Which voxels ``(x, y, z)`` of a volume have a label, and its affine map to millimetres.
+    """Mask ``(x, y, z)`` of the voxels with a label, and the affine map to millimetres.
 
     See :func:`read_volume`.
     """
@@ -88,12 +86,12 @@ def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarra
 
 
 def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], np.ndarray]:
-    """The shape of a volume and its affine map to millimetres, RAS; of grey values too.
+    """Read the shape of a volume, of labels or grey values, and its affine map to mm, RAS.
 
     Raises
     ------
     ValueError
-        When the file is no NIfTI or MGH volume of three dimensions.
+        If the file is not a NIfTI or MGH volume of three dimensions.
     """
     check_there(path)
     with reading(path, "a volume"):
@@ -103,7 +101,7 @@ def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], np.ndarray
 
 
 def _volume(data):
-    """Whole numbers (x, y, z), the affine map of their indices to millimetres, and attributes."""
+    """Labels (x, y, z), affine map of indices to millimetres, and attributes."""
     kind, name = _kind_of(data)
     header = kind.header_class.from_fileobj(io.BytesIO(data))
     shape = _shape_of(header)
@@ -114,30 +112,27 @@ def _volume(data):
     values = np.asanyarray(kind.from_bytes(data).dataobj).reshape(shape)
     if values.dtype.kind not in "iub":
         if values.dtype.kind != "f" or not np.array_equal(values, np.round(values)):
-            raise ValueError("whole numbers expected, one a structure: this is no label volume")
+            raise ValueError("integers expected: this is not a label volume")
         values = values.astype(np.int64)
-    affine, says = _affine_of(header, name)
-    note = "the volume does not say how it lies, left and right may be exchanged"
-    return (
-        values,
-        affine,
-        {"format": name} | ({"coordinate_system": "RAS"} if says else {"note": note}),
-    )
+    affine, is_oriented = _affine_of(header, name)
+    note = "the volume has no orientation, left and right may be exchanged"
+    frame = {"coordinate_system": "RAS"} if is_oriented else {"note": note}
+    return values, affine, {"format": name} | frame
 
 
 def _kind_of(data):
-    """The class of nibabel's for the first bytes of a file, and the name of the format."""
+    """Class of nibabel for the first bytes of a file, and name of the format."""
     import nibabel
 
     if data[:4] == b"\0\0\0\1":
         return nibabel.MGHImage, "MGH"
     if is_volume(data):
         return nibabel.Nifti1Image, "NIfTI"
-    raise ValueError(f"NIfTI or MGH expected, found {len(data)} bytes of something else")
+    raise ValueError(f"NIfTI or MGH expected, found {len(data)} bytes of an unknown format")
 
 
 def _shape_of(header):
-    """Three dimensions; ones at the end are none."""
+    """Sizes of the three dimensions; trailing dimensions of size 1 are dropped."""
     shape = tuple(int(n) for n in header.get_data_shape())
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
@@ -147,10 +142,10 @@ def _shape_of(header):
 
 
 def _affine_of(header, name):
-    """The map of indices to millimetres, and whether the header says how the volume lies."""
+    """Map of indices to millimetres, and whether the header has an orientation."""
     affine = np.array(header.get_best_affine(), float)
     if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) < 1e-12:
-        raise ValueError("its affine map to millimetres cannot be inverted")
+        raise ValueError("an invertible affine map to millimetres needed")
     if name == "MGH":
         return affine, True
     affine[:3] *= MILLIMETRES[header.get_xyzt_units()[0]]
@@ -158,23 +153,24 @@ def _affine_of(header, name):
 
 
 def _marked(values, label):
-    """Which voxels are inside."""
-    found = np.unique(values)
-    found = found[found != 0].tolist()
-    if not found:
-        raise ValueError("every voxel is 0: nothing is marked")
-    wanted = found if label == "all" else [int(one) for one in str(label).split(",")]
-    missing = [one for one in wanted if one not in found]
+    """Mask of the voxels with the label."""
+    labels = np.unique(values)
+    labels = labels[labels != 0].tolist()
+    if not labels:
+        raise ValueError("a label expected, found 0 in every voxel")
+    wanted = labels if label == "all" else [int(word) for word in str(label).split(",")]
+    missing = [value for value in wanted if value not in labels]
     if missing:
-        there = ", ".join(map(str, found[:_MOST_REPORTED])) + " ..." * (len(found) > _MOST_REPORTED)
-        raise ValueError(f"label {', '.join(map(str, missing))} expected, found {there}")
+        found = ", ".join(map(str, labels[:_MOST_REPORTED]))
+        found += " ..." * (len(labels) > _MOST_REPORTED)
+        raise ValueError(f"label {', '.join(map(str, missing))} expected, found {found}")
     return np.isin(values, wanted)
 
 
 def _boundary(inside):
-    """Points (n, 3) in indices of voxels, triangles, and whether the volume's border was reached.
+    """Points ``(n, 3)`` in voxel indices, triangles, and whether the border was reached.
 
-    Seen from outside the triangles are counter-clockwise where the axes are right-handed.
+    In right-handed axes, triangles are counter-clockwise seen from outside.
     """
     from skimage.measure import marching_cubes
 
@@ -193,9 +189,9 @@ def _boundary(inside):
 
 
 def smoothed(X: np.ndarray, T: np.ndarray, iterations: int = ITERATIONS) -> np.ndarray:
-    """Points ``(n, 3)`` of a mesh after iterations of Taubin's smoothing, which keeps its volume.
+    """Smooth the points ``(n, 3)`` of a mesh by Taubin's method, which preserves the volume.
 
-    A step goes towards the mean of the neighbours, the next a little farther back.
+    Each step towards the mean of the neighbours is followed by a slightly larger step back.
 
     Examples
     --------

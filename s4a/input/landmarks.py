@@ -1,4 +1,4 @@
-"""Landmarks and curves on a surface: where a mesh has what a file of points says (6.2, Fig. 7)."""
+"""Landmarks and curves on a surface (6.2, Fig. 7)."""
 
 from collections import Counter
 from pathlib import Path
@@ -8,20 +8,20 @@ import xarray as xr
 
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, edge_graph, edges, triangle_areas
-from s4a.input.annotations import MIRROR, read_landmarks
+from s4a.input.annotations import RAS_TO_LPS, read_landmarks
 from s4a.input.raw import shown
 from s4a.schema import check_type, dataset, require
 
 NAMED = ("landmark_name", "landmark_curve", "landmark_closed")
 ITERATIONS = 12  # halvings of a segment of a curve
-# Of sqrt(area): a landmark farther from its surface belongs to another mesh or frame.
+# share of sqrt(area): a landmark farther from its surface belongs to another mesh or frame
 FARTHEST_LANDMARK = 0.03
-# of files that may be named as a shape; the longer before those that they end with
+# endings of landmark files named after shapes; longer ones first
 SUFFIXES = (".landmarks.csv", ".mrk.json", ".json", ".csv", ".pp")
 
 
 def as_landmarks(landmarks: xr.Dataset | Path | str) -> xr.Dataset:
-    """Return landmarks that are given as a Dataset, or read their file if a path is given."""
+    """Return landmarks given as a Dataset, or read their file if a path is given."""
     if isinstance(landmarks, str | Path):
         return read_landmarks(landmarks)
     read = "a landmark file, or what s4a.input.annotations.read_landmarks returns"
@@ -33,51 +33,52 @@ def as_landmarks(landmarks: xr.Dataset | Path | str) -> xr.Dataset:
 def locate(
     landmarks: xr.Dataset, mesh: xr.Dataset, *, farthest: float = FARTHEST_LANDMARK
 ) -> xr.Dataset:
-    """Landmarks on a surface: the closest point of the surface to each.
+    """Project landmarks to the closest points of a surface.
 
-    Where landmarks and mesh say their coordinate systems and one is RAS, the other LPS, x and y
-    change sign; where the mesh says none, they do so if the landmarks lie on the surface only then.
+    Landmarks are converted between RAS and LPS if they and the mesh differ, or, if the mesh has no
+    coordinate system, if they lie on the surface only then.
 
     Parameters
     ----------
     landmarks : Dataset
-        ``landmark_name``, ``landmark_position`` in the unit of the mesh, as of
+        ``landmark_name``, ``landmark_position`` in the unit of the mesh, see
         :func:`s4a.input.annotations.read_landmarks`.
     mesh : Dataset
     farthest : float
-        As a share of sqrt(area of the mesh).
+        Largest distance, as a share of sqrt(area of the mesh).
 
     Returns
     -------
     Dataset
         ``landmark_name``, ``landmark_position`` on the surface, ``landmark_triangle``,
-        ``landmark_barycentric`` and ``landmark_distance`` from the surface, before.
+        ``landmark_barycentric`` and ``landmark_distance``, the distance before the projection.
 
     Raises
     ------
     ValueError
-        When a landmark is not finite or farther from the surface than `farthest`; it names the
-        worst.
+        If a landmark is not finite, or farther from the surface than `farthest`; the message names
+        the worst.
     """
     landmarks = as_landmarks(landmarks)
     require(mesh, "position", "corner_vertex", what="mesh")
     X, T = as_arrays(mesh)
     limit = farthest * np.sqrt(triangle_areas(X, T).sum())
     P = landmarks["landmark_position"].values.astype(float)
-    away = ~(abs(P - X.mean(0)).max(1) < 1e9 * np.sqrt(triangle_areas(X, T).sum()))  # or NaN
-    if away.any():
-        first = int(away.argmax())
+    invalid = ~(abs(P - X.mean(0)).max(1) < 1e9 * np.sqrt(triangle_areas(X, T).sum()))  # or NaN
+    if invalid.any():
+        i = int(invalid.argmax())
         raise ValueError(
             "landmarks need finite positions near the surface; "
-            f"{str(landmarks['landmark_name'].values[first])!r} is at {P[first].tolist()}"
+            f"{str(landmarks['landmark_name'].values[i])!r} is at {P[i].tolist()}"
         )
-    theirs = landmarks.attrs.get("coordinate_system", "")
-    ours = mesh.attrs.get("coordinate_system", "")
-    place, point, distance = _project(P * MIRROR if theirs and ours and theirs != ours else P, X, T)
-    if theirs and not ours and distance.max() > limit:
-        mirrored = _project(P * MIRROR, X, T)
-        if mirrored[2].max() < distance.max():
-            place, point, distance = mirrored
+    system = landmarks.attrs.get("coordinate_system", "")
+    mesh_system = mesh.attrs.get("coordinate_system", "")
+    differ = system and mesh_system and system != mesh_system
+    surface_point, position, distance = _project(P * RAS_TO_LPS if differ else P, X, T)
+    if system and not mesh_system and distance.max() > limit:
+        converted = _project(P * RAS_TO_LPS, X, T)
+        if converted[2].max() < distance.max():
+            surface_point, position, distance = converted
     if distance.max() > limit:
         worst = int(distance.argmax())
         name = str(landmarks["landmark_name"].values[worst])
@@ -88,23 +89,23 @@ def locate(
             "or coordinate system (RAS, LPS)?"
         )
     return _located(
-        place,
-        landmark_position=point,
+        surface_point,
+        landmark_position=position,
         landmark_distance=distance,
         **{name: landmarks[name].values for name in NAMED if name in landmarks},
     )
 
 
 def _project(P, X, T):
-    """Place of the closest point of the surface to each P, the point, and its distance."""
-    place = closest_point(P, X, T)
-    point = interpolate(X, T, *place)
-    return place, point, np.linalg.norm(point - P, axis=1)
+    """Closest surface point (triangle, weights) of each P, its position, and its distance."""
+    surface_point = closest_point(P, X, T)
+    position = interpolate(X, T, *surface_point)
+    return surface_point, position, np.linalg.norm(position - P, axis=1)
 
 
-def _located(place, **variables):
-    """A Dataset of landmarks at a place on the surface."""
-    triangle, weights = place
+def _located(surface_point, **variables):
+    """Dataset of landmarks at surface points (triangle, weights)."""
+    triangle, weights = surface_point
     return dataset(
         landmark_triangle=triangle.astype(np.int32), landmark_barycentric=weights, **variables
     )
@@ -113,26 +114,26 @@ def _located(place, **variables):
 def follow(
     P: np.ndarray, X: np.ndarray, T: np.ndarray, *, closed: bool = False, spacing: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A polyline on a surface: through points, with further ones in between.
+    """Refine a polyline on a surface.
 
-    Every segment that is longer than `spacing` is halved, and its middle moved to the closest point
+    Segments longer than `spacing` are halved repeatedly, and midpoints moved to the closest point
     of the surface.
 
     Parameters
     ----------
     P : float ndarray (p, 3)
-        In order along the curve, on the surface.
+        Points on the surface, in order along the curve.
     X, T : the mesh
     closed : bool
-        Whether a segment leads from the last point to the first.
+        Connect the last point to the first.
     spacing : float
-        In the unit of the mesh.
+        Longest segment, in the unit of the mesh.
 
     Returns
     -------
     points : float ndarray (q, 3)
     is_given : bool ndarray (q,)
-        Which of them are those of P.
+        Mask of the points of P.
 
     Examples
     --------
@@ -156,28 +157,28 @@ def follow(
 
 
 def trace_curves(landmarks: xr.Dataset, mesh: xr.Dataset) -> xr.Dataset:
-    """Landmarks of :func:`locate`, and points in between along every curve, an edge's length apart.
+    """Refine the curves among landmarks of :func:`locate` to the mean edge length.
 
-    The points in between have no name; their curve is that of their neighbours.
+    The added points have no name; their curve is that of their neighbours.
     """
     X, T = as_arrays(mesh)
     spacing = edge_graph(X, edges(T)).data.mean()
     P = landmarks["landmark_position"].values
     curve = landmarks["landmark_curve"].values
     closed = landmarks["landmark_closed"].values
-    alone = np.flatnonzero(curve == "")
-    points = [P[alone]]
-    is_given = [np.ones(len(alone), bool)]
-    before = [alone]  # the landmark that each point is, or comes after
+    no_curve = np.flatnonzero(curve == "")
+    points = [P[no_curve]]
+    is_given = [np.ones(len(no_curve), bool)]
+    origins = [no_curve]  # the landmark that each point is, or comes after
     for name in dict.fromkeys(curve[curve != ""].tolist()):
-        own = np.flatnonzero(curve == name)
-        line, on_line = follow(P[own], X, T, closed=bool(closed[own[0]]), spacing=spacing)
+        index = np.flatnonzero(curve == name)
+        line, on_line = follow(P[index], X, T, closed=bool(closed[index[0]]), spacing=spacing)
         points.append(line)
         is_given.append(on_line)
-        before.append(own[np.cumsum(on_line) - 1])
+        origins.append(index[np.cumsum(on_line) - 1])
     point = np.concatenate(points)
     given = np.concatenate(is_given)
-    origin = np.concatenate(before)
+    origin = np.concatenate(origins)
     return _located(
         closest_point(point, X, T),
         landmark_position=point,
@@ -189,31 +190,36 @@ def trace_curves(landmarks: xr.Dataset, mesh: xr.Dataset) -> xr.Dataset:
 
 
 def with_landmarks(mesh: xr.Dataset, landmarks: xr.Dataset | Path | str) -> xr.Dataset:
-    """A mesh that knows its landmarks, so that registration holds them together.
+    """Add landmarks that guide the registration of a mesh.
 
-    Landmarks are paired by name: those that two shapes have guide the rigid transform and, in far
-    poses, the initial map, and pull the elastic iterations (:mod:`s4a.method.elastic`).  Points of
-    curves have no partner and are left out.
+    Landmarks of two shapes are paired by name.  They guide the rigid alignment, the initial map for
+    large pose differences, and the elastic iterations (:mod:`s4a.method.elastic`).  Points of
+    curves are not paired and are ignored.
 
     Parameters
     ----------
     mesh : Dataset
-        Clean, as of :func:`s4a.read_shape` or :func:`s4a.clean`.
+        Clean mesh, see :func:`s4a.read_shape` and :func:`s4a.clean`.
     landmarks : Dataset or path
-        As of :func:`s4a.input.annotations.read_landmarks`, or a file that it reads.
+        A landmark file, or what :func:`s4a.input.annotations.read_landmarks` returns.
 
     Returns
     -------
     Dataset
-        The mesh, and what :func:`locate` says as ``guide_name(guide)``, ``guide_position`` and so
-        on.  Landmarks without them (``landmark_name``) are carried over and compared, and guide
-        nothing.
+        The mesh with the variables of :func:`locate`, named ``guide_name(guide)``,
+        ``guide_position`` and so on.  Landmarks named ``landmark_name`` are transferred and
+        compared, and do not guide.
 
     Raises
     ------
     ValueError
-        When the file cannot be read, no landmark is left, two have one name, or one is farther from
-        the surface than 3 % of sqrt(area).
+        If the file cannot be read, there is no landmark, two have the same name, or one is farther
+        from the surface than 3 % of sqrt(area).
+
+    See Also
+    --------
+    with_features : guide the registration by scalar fields.
+    transfer_landmarks : transfer landmarks to all shapes of a study.
 
     Examples
     --------
@@ -224,25 +230,25 @@ def with_landmarks(mesh: xr.Dataset, landmarks: xr.Dataset | Path | str) -> xr.D
     >>> s4a.with_landmarks(mesh, top)["guide_name"].values.tolist()
     ['top']
     """
-    given = as_landmarks(landmarks)
-    where = "landmarks" if isinstance(landmarks, xr.Dataset) else shown(landmarks)
-    if "landmark_curve" in given:
-        given = given.isel(landmark=given["landmark_curve"].values == "")
-        given = given.drop_vars(["landmark_curve", "landmark_closed"])
-    names = given["landmark_name"].values.tolist()
-    twice = [name for name, count in Counter(names).items() if count > 1]
-    if twice or not names:
+    points = as_landmarks(landmarks)
+    what = "landmarks" if isinstance(landmarks, xr.Dataset) else shown(landmarks)
+    if "landmark_curve" in points:
+        points = points.isel(landmark=points["landmark_curve"].values == "")
+        points = points.drop_vars(["landmark_curve", "landmark_closed"])
+    names = points["landmark_name"].values.tolist()
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated or not names:
         raise ValueError(
-            f"{where}: landmarks of different names needed, found "
-            + (f"{twice[0]!r} {names.count(twice[0])} times" if twice else "none")
+            f"{what}: landmarks with unique names needed, found "
+            + (f"{repeated[0]!r} {names.count(repeated[0])} times" if repeated else "none")
         )
-    there = locate(given, mesh)
-    guides = {str(name).replace("landmark", "guide"): there[name].values for name in there}
+    located = locate(points, mesh)
+    guides = {str(name).replace("landmark", "guide"): located[name].values for name in located}
     return mesh.drop_dims("guide", errors="ignore").merge(dataset(None, **guides))
 
 
 def guides_of(mesh: xr.Dataset) -> xr.Dataset:
-    """The landmarks that guide the registration of a mesh, as :func:`with_landmarks` takes them."""
+    """Return the landmarks that guide the registration of a mesh, for :func:`with_landmarks`."""
     return dataset(
         landmark_name=mesh["guide_name"].values, landmark_position=mesh["guide_position"].values
     )

@@ -1,6 +1,6 @@
-"""Plausibility (5.1, the data): what looks wrong with a shape beside the others of its collection.
+"""Plausibility (5.1, the data): detect shapes that differ suspiciously from their collection.
 
-It is named and never changed.
+Suspect shapes are reported and never changed.
 """
 
 import itertools
@@ -23,49 +23,49 @@ from s4a.geometry.mesh import (
     vertex_normals,
     volume,
 )
-from s4a.input.chirality import COMMON_SIDE, MIRROR, OTHER_SIDE, hands
+from s4a.input.chirality import COMMON_SIDE, MIRROR, OTHER_SIDE, mean_chirality
 from s4a.input.subjects import listed as first_of
 from s4a.schema import dataset
 
-N_POINTS = 3000  # vertices of each shape that are looked at
+N_POINTS = 3000  # vertices of each shape that are used
 N_PAIRED = 300  # of them, those that ICP pairs
-N_ROUGH = 100  # of them, those that ICP pairs while it compares starts
-N_REFERENCES = 6  # shapes beside which every shape is seen
-_ENOUGH = 5  # shapes, so that there is a usual spread
-_USUAL = 3.0  # spreads within which a shape can be a reference
-# least spreads, of logarithms; collections that vary less would make each of their shapes odd
+N_ROUGH = 100  # of them, those that ICP pairs while it compares initialisations
+N_REFERENCES = 6  # shapes that every shape is compared with
+_ENOUGH = 5  # shapes from which deviations are estimated
+_USUAL = 3.0  # deviations within which a shape can be a reference
+# least deviations, of logarithms; in collections that vary less every shape would be an outlier
 SIZE, COMPACTNESS, MOMENT = 0.05, 0.03, 0.05
-_TINY = 1e-3  # gaps below it, of shapes that are the same, are no evidence
+_TINY = 1e-3  # smaller distances, of identical shapes, are no evidence
 _HALF_TURNS = [np.diag(d) for d in itertools.product((1.0, -1.0), repeat=3) if np.prod(d) == 1]
 
 
 def describe(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
-    """Descriptor of one shape: some of its vertices and rigidly invariant numbers.
+    """Descriptor of one shape: a sample of its vertices and rigidly invariant numbers.
 
     Parameters
     ----------
     mesh : Dataset
-        Clean, as of :func:`s4a.clean`.
+        Clean mesh, see :func:`s4a.clean`.
     intersections : bool
-        Whether triangles that pass through others are counted.
+        Count self-intersecting triangles.
 
     Returns
     -------
     Dataset
         ``descriptor_position``, ``descriptor_area``, ``descriptor_normal`` of 3,000 vertices,
         evenly from the order of the file, centred and of unit root mean square radius;
-        ``descriptor_asymmetry``, how far the mirror image lies above each; ``moment``.  Attributes:
-        ``compactness`` (volume over area^1.5), ``chirality`` (skewness along the three axes,
-        multiplied; a mirror image has the other sign), ``open_boundary`` (:func:`hole_length` over
+        ``descriptor_asymmetry``, signed distance of the mirror image; ``moment``.  Attributes:
+        ``compactness`` (volume over area^1.5), ``chirality`` (product of the skewness along the
+        three axes; a mirror image has the other sign), ``open_boundary`` (:func:`hole_length` over
         sqrt(area)), ``lattice`` (:func:`lattice_step` over the median edge), ``self_intersections``
-        and ``intersecting`` (their share of the triangles); -1 where they were not counted.
+        and ``intersecting`` (share of the triangles); -1 if they were not counted.
 
     Examples
     --------
     >>> import s4a
     >>> from s4a.input.plausibility import describe
-    >>> seen = describe(s4a.synthetic.sphere(500), intersections=False)
-    >>> seen["moment"].values.round(2).tolist(), round(seen.attrs["compactness"], 3)
+    >>> sphere = describe(s4a.synthetic.sphere(500), intersections=False)
+    >>> sphere["moment"].values.round(2).tolist(), round(sphere.attrs["compactness"], 3)
     ([0.33, 0.33, 0.33], 0.094)
     """
     X, T = as_arrays(mesh)
@@ -99,9 +99,9 @@ def describe(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
 
 
 def hole_length(X: np.ndarray, boundary: np.ndarray) -> float:
-    """Length of the loops of boundary edges (b, 2), root of the sum of squares.
+    """Root of the sum of squared lengths of the loops of boundary edges ``(b, 2)``.
 
-    One long loop is a part cut off; many short ones are holes of a scan, and count for little.
+    One long loop, a missing part, counts more than many short ones, holes of a scan.
 
     Examples
     --------
@@ -116,7 +116,7 @@ def hole_length(X: np.ndarray, boundary: np.ndarray) -> float:
 
 
 def lattice_step(X: np.ndarray) -> float:
-    """Step of the lattice that coordinates are rounded to, the least of the three; else zero.
+    """Step of the lattice that coordinates are rounded to, the least of the axes; 0 if none.
 
     Examples
     --------
@@ -136,19 +136,16 @@ def lattice_step(X: np.ndarray) -> float:
     return min(steps)
 
 
-def _in_numbers(descriptors):
-    """Logarithms of area, compactness and the three moments of shapes (n, 5)."""
-    rows = [
-        [one.attrs["surface"], one.attrs["compactness"], *one["moment"].values]
-        for one in descriptors
-    ]
+def _log_measures(descriptors):
+    """Logarithms of area, compactness and the three moments of shapes ``(n, 5)``."""
+    rows = [[d.attrs["surface"], d.attrs["compactness"], *d["moment"].values] for d in descriptors]
     return np.log(np.maximum(rows, 1e-300)).reshape(-1, 5)
 
 
 def excess(values: np.ndarray, least: float | np.ndarray) -> np.ndarray:
-    """How far each value lies from the median of the others, in their spreads.
+    """Leave-one-out robust z-score: distance from the median of the other values, in deviations.
 
-    The spread is 1.48 times the median distance from that median, widened where the others are few,
+    The deviation is 1.48 times the median absolute deviation, increased if there are few values,
     and at least `least`.
 
     Parameters
@@ -167,17 +164,17 @@ def excess(values: np.ndarray, least: float | np.ndarray) -> np.ndarray:
     >>> excess(np.array([1.0, 1.1, 0.9, 1.0, 3.0]), 0.1).round(1).tolist()
     [-0.2, 0.6, -0.9, -0.2, 12.2]
     """
-    found = np.empty(np.shape(values))
+    score = np.empty(np.shape(values))
     for i in range(len(values)):
         others = np.delete(values, i, axis=0)
-        middle = np.median(others, axis=0)
-        spread = 1.4826 * np.median(np.abs(others - middle), axis=0) * (1 + 3 / len(others))
-        found[i] = (values[i] - middle) / np.hypot(spread, least)
-    return found
+        median = np.median(others, axis=0)
+        deviation = 1.4826 * np.median(np.abs(others - median), axis=0) * (1 + 3 / len(others))
+        score[i] = (values[i] - median) / np.hypot(deviation, least)
+    return score
 
 
 def pick_references(descriptors: dict[str, xr.Dataset], most: int = N_REFERENCES) -> list[str]:
-    """Names of the shapes beside which all are seen: of usual form, spread over the sizes.
+    """Names of the reference shapes: without outliers, evenly over the sizes.
 
     Examples
     --------
@@ -185,31 +182,30 @@ def pick_references(descriptors: dict[str, xr.Dataset], most: int = N_REFERENCES
     >>> from s4a.input.plausibility import pick_references, describe
     >>> shapes = {f"s{n}": s4a.synthetic.sphere(n) for n in (100, 150, 200, 250, 300)}
     >>> shapes["long"] = s4a.synthetic.ellipsoid(300, (9, 1, 1))
-    >>> seen = {name: describe(mesh, intersections=False) for name, mesh in shapes.items()}
-    >>> "long" in pick_references(seen)
+    >>> "long" in pick_references({n: describe(m, intersections=False) for n, m in shapes.items()})
     False
     """
-    numbers = _in_numbers(list(descriptors.values()))
-    odd = np.zeros(len(numbers), bool)
+    numbers = _log_measures(list(descriptors.values()))
+    is_outlier = np.zeros(len(numbers), bool)
     if len(numbers) >= _ENOUGH:
         least = np.array([SIZE, COMPACTNESS, MOMENT, MOMENT, MOMENT])
-        odd = np.abs(excess(numbers, least)).max(1) > _USUAL
+        is_outlier = np.abs(excess(numbers, least)).max(1) > _USUAL
     usual = [
         (size, name)
-        for name, size, far in zip(descriptors, numbers[:, 0], odd, strict=True)
-        if not far
+        for name, size, skip in zip(descriptors, numbers[:, 0], is_outlier, strict=True)
+        if not skip
     ]
     names = [name for _, name in sorted(usual)] or list(descriptors)
-    return spread(names, most)
+    return evenly_chosen(names, most)
 
 
-def spread(names: list[str], most: int) -> list[str]:
-    """Some of many names, evenly, without the first and the last.
+def evenly_chosen(names: list[str], most: int) -> list[str]:
+    """Choose at most `most` of the names, evenly, without the first and the last.
 
     Examples
     --------
-    >>> from s4a.input.plausibility import spread
-    >>> spread(["a", "b", "c", "d", "e", "f"], 2), spread(["a"], 2)
+    >>> from s4a.input.plausibility import evenly_chosen
+    >>> evenly_chosen(["a", "b", "c", "d", "e", "f"], 2), evenly_chosen(["a"], 2)
     (['b', 'e'], ['a'])
     """
     if len(names) <= most:
@@ -219,67 +215,66 @@ def spread(names: list[str], most: int) -> list[str]:
 
 
 def compare(name: str, descriptor: xr.Dataset, references: dict[str, xr.Dataset]) -> xr.Dataset:
-    """A shape beside its references: how closely it fits each, and of which hand it is.
+    """Compare a shape with references: quality of fit, and chirality.
 
     Parameters
     ----------
     name : str
-        Of the shape; where it is one of the references itself, its values there are NaN.
+        Name of the shape; if it is a reference itself, its values there are NaN.
     descriptor : Dataset
         Of :func:`describe`.
     references : dict of str to Dataset
-        Portraits of the shapes that :func:`pick_references` names.
+        Descriptors of the shapes that :func:`pick_references` names.
 
     Returns
     -------
     Dataset
-        The descriptor without its descriptor, with ``reference`` as coordinate, ``fit`` and
-        ``fit_mirrored``, the residual of ICP of the shape and of its mirror image, as shares of
-        the root mean square radius; ``hand``, positive where the shape is of the reference's hand
-        and negative where its mirror image is, near zero where both could be.
+        ``moment`` and the attributes of the descriptor, with ``reference`` as coordinate; ``fit``
+        and ``fit_mirrored``, the ICP residuals of the shape and of its mirror image, as shares of
+        the root mean square radius; ``chirality``, positive if the shape is of the same side as
+        the reference, negative if its mirror image is, near zero if that is not clear.
     """
-    straight, mirrored = view(descriptor), view(descriptor, MIRROR)
-    own_asymmetry = descriptor["descriptor_asymmetry"].values
+    shape, mirrored = view(descriptor), view(descriptor, MIRROR)
+    shape_asymmetry = descriptor["descriptor_asymmetry"].values
     rows = []
-    for other, seen in references.items():
+    for other, data in references.items():
         if other == name:
             rows.append((np.nan,) * 3)
             continue
-        reference, asymmetry = view(seen), seen["descriptor_asymmetry"].values
-        fit, gap, alike = _likeness(straight, reference, own_asymmetry, asymmetry)
-        fit_mirrored, gap_mirrored, alike_mirrored = _likeness(
-            mirrored, reference, own_asymmetry, asymmetry
+        reference, asymmetry = view(data), data["descriptor_asymmetry"].values
+        fit, distance, correlation = _similarity(shape, reference, shape_asymmetry, asymmetry)
+        fit_mirrored, distance_mirrored, correlation_mirrored = _similarity(
+            mirrored, reference, shape_asymmetry, asymmetry
         )
-        nearer = np.log(max(gap_mirrored, _TINY) / max(gap, _TINY))
-        rows.append((fit, fit_mirrored, alike - alike_mirrored + nearer))
-    fit, fit_mirrored, hand = np.array(rows).reshape(-1, 3).T
-    own = descriptor.drop_vars(
-        [str(v) for v in descriptor.data_vars if str(v).startswith("sketch_")]
-    )
-    beside = dataset(fit=fit, fit_mirrored=fit_mirrored, chirality=hand)
-    return own.assign(beside.variables).assign_coords(reference=list(references))
+        closer = np.log(max(distance_mirrored, _TINY) / max(distance, _TINY))
+        rows.append((fit, fit_mirrored, correlation - correlation_mirrored + closer))
+    fit, fit_mirrored, chirality = np.array(rows).reshape(-1, 3).T
+    arrays = [str(v) for v in descriptor.data_vars if str(v).startswith("descriptor_")]
+    comparison = dataset(fit=fit, fit_mirrored=fit_mirrored, chirality=chirality)
+    data = descriptor.drop_vars(arrays).assign(comparison.variables)
+    return data.assign_coords(reference=list(references))
 
 
 def examine(meshes: dict[str, xr.Dataset], *, intersections: bool = True) -> dict[str, xr.Dataset]:
-    """:func:`compare` of every shape with the references of the collection.
+    """:func:`compare` every shape with the references of the collection.
 
     Examples
     --------
     >>> import s4a
     >>> from s4a.input.plausibility import examine
-    >>> seen = examine({"a": s4a.synthetic.sphere(300), "b": s4a.synthetic.ellipsoid(300)})
-    >>> seen["a"]["fit"].round(2).values.tolist()
+    >>> shapes = examine({"a": s4a.synthetic.sphere(300), "b": s4a.synthetic.ellipsoid(300)})
+    >>> shapes["a"]["fit"].round(2).values.tolist()
     [nan, 0.23]
     """
     intersections = can_count(intersections)
-    seen = {name: describe(mesh, intersections=intersections) for name, mesh in meshes.items()}
-    references = {name: seen[name] for name in pick_references(seen)}
-    return {name: compare(name, one, references) for name, one in seen.items()}
+    descriptors = {name: describe(m, intersections=intersections) for name, m in meshes.items()}
+    references = {name: descriptors[name] for name in pick_references(descriptors)}
+    return {name: compare(name, data, references) for name, data in descriptors.items()}
 
 
 @dataclass(frozen=True)
 class View:
-    """A descriptor as ICP takes it; see :func:`view`."""
+    """Input of ICP, made from a descriptor by :func:`view`."""
 
     cloud: Cloud
     rough: Cloud  # pairs fewer of its vertices
@@ -288,60 +283,64 @@ class View:
 
 
 def view(descriptor: xr.Dataset, flip: np.ndarray | float = 1.0) -> View:
-    """A descriptor, or with ``flip=MIRROR`` its mirror image, ready for ``_best_pose``."""
+    """Prepare a descriptor, or with ``flip=MIRROR`` its mirror image, for ``_best_pose``."""
     X, area = descriptor["descriptor_position"].values * flip, descriptor["descriptor_area"].values
-    whole = cloud(X, area, N_PAIRED)
-    rough = Cloud(X, area, whole.tree, whole.paired[:N_ROUGH])
+    fine = cloud(X, area, N_PAIRED)
+    rough = Cloud(X, area, fine.tree, fine.paired[:N_ROUGH])
     axes = principal_axes(X, area)[1]
-    return View(whole, rough, axes, descriptor["descriptor_normal"].values * flip)
+    return View(fine, rough, axes, descriptor["descriptor_normal"].values * flip)
 
 
 def _best_pose(shape, reference):
-    """ICP of a shape onto a reference, from eight turns: as it is, by its axes, half turns of both.
+    """Align a shape to a reference by ICP from eight rotations, of the file and of the axes.
 
     Returns
     -------
     R, t, residual
         As of :func:`s4a.geometry.align.icp_each`.
     """
-    turns = _HALF_TURNS + [reference.axes @ half_turn @ shape.axes.T for half_turn in _HALF_TURNS]
-    starts = [(R, np.zeros(3)) for R in turns]
-    rough = icp_each(shape.rough, reference.rough, starts, tolerance=1e-3, iterations=5)
+    rotations = _HALF_TURNS + [reference.axes @ turn @ shape.axes.T for turn in _HALF_TURNS]
+    initial = [(R, np.zeros(3)) for R in rotations]
+    rough = icp_each(shape.rough, reference.rough, initial, tolerance=1e-3, iterations=5)
     best = [(R, t) for R, t, _ in sorted(rough, key=residual_of)[:2]]
-    ends = icp_each(shape.cloud, reference.cloud, best, tolerance=1e-4, iterations=30)
-    return min(ends, key=residual_of)
+    poses = icp_each(shape.cloud, reference.cloud, best, tolerance=1e-4, iterations=30)
+    return min(poses, key=residual_of)
 
 
-def _gaps(shape, reference, end):
-    """Signed distances along the normals, (n,) and (p,), and the vertices that face each other."""
-    R, t, _ = end
+def _distances(shape, reference, pose):
+    """Signed distances along the normals, (n,) and (p,), and the nearest vertices (n,)."""
+    R, t, _ = pose
     X, Y = shape.cloud.X @ R.T + t, reference.cloud.X
-    there = reference.cloud.tree.query(X)[1]  # (n,)
-    back = shape.cloud.tree.query((Y - t) @ R)[1]  # (p,)
-    above = ((X - Y[there]) * reference.normal[there]).sum(1)
-    below = ((Y - X[back]) * (shape.normal[back] @ R.T)).sum(1)
-    return above, below, there
+    nearest = reference.cloud.tree.query(X)[1]  # (n,)
+    nearest_of_reference = shape.cloud.tree.query((Y - t) @ R)[1]  # (p,)
+    normal = shape.normal[nearest_of_reference] @ R.T
+    above = ((X - Y[nearest]) * reference.normal[nearest]).sum(1)
+    below = ((Y - X[nearest_of_reference]) * normal).sum(1)
+    return above, below, nearest
 
 
 def _asymmetry(descriptor):
-    """How far the mirror image lies above each vertex of a descriptor (n,), centred, tails cut."""
-    mirror_image, own = view(descriptor, MIRROR), view(descriptor)
-    _, below, _ = _gaps(mirror_image, own, _best_pose(mirror_image, own))
+    """Signed distance of the mirror image at each vertex of a descriptor ``(n,)``.
+
+    Values beyond the 95 % quantile are clipped, and the mean is subtracted.
+    """
+    mirrored, shape = view(descriptor, MIRROR), view(descriptor)
+    _, below, _ = _distances(mirrored, shape, _best_pose(mirrored, shape))
     limit = np.quantile(np.abs(below), 0.95)
     height = -np.clip(below, -limit, limit)
-    return height - own.cloud.area @ height
+    return height - shape.cloud.area @ height
 
 
-def _likeness(shape, reference, asymmetry, reference_asymmetry):
-    """Residual, mean gap along the normals, and how alike the asymmetries are, -1 to 1."""
-    end = _best_pose(shape, reference)
-    above, below, there = _gaps(shape, reference, end)
+def _similarity(shape, reference, asymmetry, reference_asymmetry):
+    """Residual, mean distance along the normals, and correlation of the asymmetries."""
+    pose = _best_pose(shape, reference)
+    above, below, nearest = _distances(shape, reference, pose)
     weight, reference_weight = shape.cloud.area, reference.cloud.area
-    gap = weight @ np.abs(above) + reference_weight @ np.abs(below)
-    a, b = asymmetry, reference_asymmetry[there]
+    distance = weight @ np.abs(above) + reference_weight @ np.abs(below)
+    a, b = asymmetry, reference_asymmetry[nearest]
     b = b - weight @ b
-    alike = weight @ (a * b) / np.sqrt(max((weight @ a**2) * (weight @ b**2), 1e-300))
-    return end[2], gap, alike
+    correlation = weight @ (a * b) / np.sqrt(max((weight @ a**2) * (weight @ b**2), 1e-300))
+    return pose[2], distance, correlation
 
 
 _AREA_DROPPED = 0.1
@@ -349,73 +348,73 @@ _UNITS = {10.0**e: f"10^{e}" for e in (-9, -6, -4, -3, -2, -1, 1, 2, 3, 4, 6, 9)
 _UNITS |= {25.4: "25.4", 1 / 25.4: "1/25.4", 2.54: "2.54", 1 / 2.54: "1/2.54"}  # inches
 
 # Thresholds, chosen on synthetic brains, cats, faces and ten bodies (docs/plausibility.md)
-_ODD_SIZE = 1.8  # times the size of the others, or less than one over it
-_OTHER_SIZE = 3.0  # the same, that no anatomy has
-SPREADS = 5.0  # times the usual spread of a size, a boundary or a form: a warning
-_EXTENT_SPREADS = 7.0  # the same of extents, which poses change
-FAR = 8.0  # the same: flagged
-_FIT = 0.12  # least spread of the logarithm of the residual
-_BOUNDARY = 0.12  # least spread of lengths over sqrt(area)
-SAME = 1e-4  # largest difference of two files of one scan, of every number below
-_CROSSING = 0.01  # share of the triangles that pass through others
-_LATTICE = 0.2  # step of rounded coordinates, of the median edge
-_MUCH_MORE = 10.0  # times the others' share of crossing triangles, or step
-CLOSE = 2.0  # times the usual residual; a part is no mirror image
+_SUSPECT_SIZE = 1.8  # times the size of the others, or less than one over it
+_IMPLAUSIBLE_SIZE = 3.0  # the same, beyond anatomical variation
+WARNED = 5.0  # deviations of a size, a boundary or a form: a warning
+_WARNED_EXTENT = 7.0  # the same of extents, which poses change
+FLAGGED = 8.0  # deviations of a form: flagged
+_FIT = 0.12  # least deviation of the logarithm of the residual
+_BOUNDARY = 0.12  # least deviation of lengths over sqrt(area)
+SAME = 1e-4  # largest difference of two files of one scan, in every number below
+_CROSSING = 0.01  # share of self-intersecting triangles
+_LATTICE = 0.2  # step of rounded coordinates, in median edges
+_MUCH_MORE = 10.0  # times the share of self-intersections, or the step, of the others
+CLOSE = 2.0  # times the usual residual; a part is not a mirror image
 
 
-# kind: whether nobody but the user knows what is meant, so that the shape is flagged (an honest
-# outlier is only named); what was found beside what; the remedy, with the flags of `s4a run`
+# kind: whether it flags the shape, as only the user can decide (an outlier in form is reported
+# only); the message, with what was found and expected; the remedy, with the flags of `s4a run`
 # fmt: off
 KINDS = {
-    "dropped": (False, "{percent:.0f} % of the area was in dropped components; "
+    "dropped": (False, "dropped components had {percent:.0f} % of the area; "
         'components=N or "all" keeps more', "--components all keeps more of them"),
     "unit": (True, "{ratio:.3g} times the size of the others, near {unit}: another unit, such as "
-        "mm for m? its size was kept; scale the file if that is wrong",
+        "mm for m? The size was not changed; scale the file if that is wrong",
         "scale the files to the unit of the others"),
-    "size": (False, "{ratio:.3g} times the size of the others; its size was kept; scale the file "
-        "if that is wrong", "scale the files, if their size is wrong"),
+    "size": (False, "{ratio:.3g} times the size of the others; the size was not changed; scale the "
+        "file if that is wrong", "scale the files if their size is wrong"),
     "genus": (False, "genus {genus}, but {usual} in {number} of {n} shapes; wrap=True closes "
         "tunnels", "--wrap closes tunnels"),
-    "intersections": (False, "{number} triangles pass through others, {percent:.1f} % (in the "
-        "others {usual_percent:.1f} %); wrap=True makes a surface that does not",
-        "--wrap makes surfaces without"),
-    "duplicate": (True, "the same surface as {other}, under two names{mirrored}; leave one of them "
-        "out, or it counts twice", "keep one file of each shape"),
-    "mirrored": (True, "fits as a mirror image (ICP residual beside most others {fit:.3f} as it "
-        "is, {fit_mirrored:.3f} reflected): left for right? It is as its file has it; reflect= "
+    "intersections": (False, "{number} triangles intersect others, {percent:.1f} % (others "
+        "{usual_percent:.1f} %); wrap=True removes self-intersections",
+        "--wrap removes self-intersections"),
+    "duplicate": (True, "the same surface as {other}{mirrored}; remove one of them, or the shape "
+        "counts twice", "keep one file of each shape"),
+    "mirrored": (True, "fits as a mirror image (median ICP residual {fit:.3f} as it is, "
+        "{fit_mirrored:.3f} reflected): left and right exchanged? It was not changed; reflect= "
         "mirrors it", "--reflect mirrors them, if left and right are exchanged"),
-    "partial": (True, "its holes are {value:.2g} of sqrt(area) long, of the others {usual:.2g}: is "
-        "a part cut off? Complete the scan, leave it out, or close_holes=True where it only has "
-        "holes", "scan again, or take the files away"),
-    "spacing": (False, "its coordinates are rounded, to {value:.2f} of an edge (in the others "
-        "{usual:.2f}); export it with more digits", "export the files with more digits"),
-    "kind": (False, "unlike the others: {what} {spreads:.0f} times the usual spread away; another "
-        "kind of shape, stretched, or a part? Look at it, and leave it out if it does not belong",
-        "take the files away, if of another kind"),
+    "partial": (True, "the holes are {value:.2g} of sqrt(area) long, of the others {usual:.2g}: is "
+        "a part missing? Complete the scan, remove it, or use close_holes=True if it only has "
+        "holes", "scan again, or remove the files"),
+    "spacing": (False, "coordinates are rounded to {value:.2f} of an edge (others {usual:.2f}); "
+        "export the file with more digits", "export the files with more digits"),
+    "kind": (False, "unlike the others: {what} {deviations:.0f} times the usual deviation away; "
+        "another kind of shape, stretched, or a part? Remove it if it does not belong to the "
+        "collection", "remove the files if they are of another kind"),
     "registration": (True, "{sure} registered wrongly ({registration_error:.3f}{distortion}): "
-        "look at it in s4a view, compare its file with the template's, or leave it out",
+        "look at it in s4a view, compare its file with the template's, or remove it",
         "look at the page; a larger --n-coarse may help"),
 }
 # fmt: on
-# kind: attribute of the evidence, and the least that is told where it is many times the others'
+# kind: attribute of the comparison, and the least value that is reported
 _MUCH_MORE_OF = {"intersections": ("intersecting", _CROSSING), "spacing": ("lattice", _LATTICE)}
 
 
 class Flag(NamedTuple):
-    """What looks wrong with a shape: a key of :data:`KINDS`, its words, whether it is flagged."""
+    """Finding about a shape: a key of :data:`KINDS`, the message, whether it flags the shape."""
 
     kind: str
     words: str
     flagged: bool
 
 
-Flags = dict[str, list[Flag]]  # name of a shape -> what looks wrong with it
+Flags = dict[str, list[Flag]]  # name of a shape -> findings
 
 
-def flag(kind: str, flagged: bool | None = None, **found: Any) -> Flag:
-    """A flag of a kind, whose words take what was `found`.
+def flag(kind: str, flagged: bool | None = None, **values: Any) -> Flag:
+    """Make a flag of a kind, with `values` in its message.
 
-    The kind says whether it makes the shape flagged, unless that is given.
+    `flagged` is that of the kind by default.
 
     Examples
     --------
@@ -424,65 +423,66 @@ def flag(kind: str, flagged: bool | None = None, **found: Any) -> Flag:
     'genus 1, but 0 in 5 of 6 shapes; wrap=True closes tunnels'
     """
     usually, words, _ = KINDS[kind]
-    return Flag(kind, words.format(**found), usually if flagged is None else bool(flagged))
+    return Flag(kind, words.format(**values), usually if flagged is None else bool(flagged))
 
 
 def in_words(flags: list[Flag]) -> str:
-    """The sentences of all flags about a shape, as they stand in the report's ``warning``."""
-    return "; ".join(one.words for one in flags)
+    """Messages of all flags of a shape, for the report's ``warning``."""
+    return "; ".join(flag.words for flag in flags)
 
 
 def find_warnings(
-    attrs: dict[str, dict[str, Any]], evidence: Mapping[str, xr.Dataset]
+    attrs: dict[str, dict[str, Any]], comparisons: Mapping[str, xr.Dataset]
 ) -> tuple[Flags, list[str]]:
-    """What looks wrong with each shape, and, in words, with the collection.
+    """Find suspect shapes, and faults of the collection.
 
     Parameters
     ----------
     attrs : dict
-        Name of every shape that is used -> attributes, as of :func:`s4a.clean`.
-    evidence : dict
+        Name of every shape that is used -> attributes of :func:`s4a.clean`.
+    comparisons : dict
         Name -> :func:`compare`; may be empty.
 
     Returns
     -------
-    of_shape : dict of str to list of Doubt
-        Every name; an empty list where nothing looks wrong.
-    of_all : list of str
+    flags : dict of str to list of Flag
+        Every name, with an empty list if nothing was found.
+    remarks : list of str
+        Findings about several shapes.
     """
-    told: Flags = {name: [] for name in attrs}
-    of_all: list[str] = []
-    seen = {name: evidence[name] for name in attrs if name in evidence}
-    # each check yields names and flags, and adds to `of_all` what concerns several shapes
-    checks = [_dropped(attrs), _sizes(attrs, of_all), _genus(attrs, of_all)]
-    if len(seen) > 1:
-        checks += [_much_more("intersections", seen), _duplicates(seen), _mirrored(seen, of_all)]
-    if len(seen) >= _ENOUGH:
-        checks += [_boundaries(seen), _much_more("spacing", seen), _forms(seen, told)]
+    flags: Flags = {name: [] for name in attrs}
+    remarks: list[str] = []
+    used = {name: comparisons[name] for name in attrs if name in comparisons}
+    # each check yields names and flags, and appends to `remarks`
+    checks = [_dropped(attrs), _sizes(attrs, remarks), _genus(attrs, remarks)]
+    if len(used) > 1:
+        checks += [_much_more("intersections", used), _duplicates(used), _mirrored(used, remarks)]
+    if len(used) >= _ENOUGH:
+        checks += [_boundaries(used), _much_more("spacing", used), _forms(used, flags)]
     for check in checks:
-        for name, one in check:
-            told[name].append(one)
-    return told, of_all
+        for name, flag_of_check in check:
+            flags[name].append(flag_of_check)
+    return flags, remarks
 
 
 def _dropped(attrs):
-    for name, said in attrs.items():
-        if said.get("area_dropped", 0) > _AREA_DROPPED:
-            yield name, flag("dropped", percent=100 * said["area_dropped"])
+    for name, values in attrs.items():
+        if values.get("area_dropped", 0) > _AREA_DROPPED:
+            yield name, flag("dropped", percent=100 * values["area_dropped"])
 
 
-def _sizes(attrs, of_all):
-    """Those of another size, or unit; of two groups of sizes, the smaller group."""
-    size = {n: np.log(said["area"]) / 2 for n, said in attrs.items() if said.get("area", 0) > 0}
+def _sizes(attrs, remarks):
+    """Flags of another size or unit; of two groups of sizes, those of the smaller group."""
+    size = {n: np.log(a["area"]) / 2 for n, a in attrs.items() if a.get("area", 0) > 0}
     names, values = np.array(list(size)), np.array(list(size.values()))
     group = _two_sizes(values)
     if group.any():
-        times = np.exp(abs(np.median(values[~group]) - np.median(values[group])))
-        of_all.append(
-            f"two sizes, {times:.3g} times apart: {first_of(names[group], most=6)}, and the "
-            "others; no size was changed: scale the files of one of them if their units differ"
+        ratio = np.exp(abs(np.median(values[~group]) - np.median(values[group])))
+        remarks.append(
+            f"two groups of sizes, with the ratio {ratio:.3g}: {first_of(names[group], most=6)}, "
+            "and the others; no size was changed: scale the files of one group if units differ"
         )
-    _different_units(attrs, of_all)
+    _different_units(attrs, remarks)
     if len(names) < 2:
         return
     far = np.abs(excess(values, SIZE)) if len(names) >= _ENOUGH else np.zeros(len(names))
@@ -490,90 +490,93 @@ def _sizes(attrs, of_all):
         usual = np.median(values[~group] if len(names) > 2 else np.delete(values, i))
         ratio = np.exp(values[i] - usual)
         off = max(ratio, 1 / ratio)
-        if off >= _OTHER_SIZE or (off > _ODD_SIZE and (far[i] > SPREADS or group[i])):
+        if off >= _IMPLAUSIBLE_SIZE or (off > _SUSPECT_SIZE and (far[i] > WARNED or group[i])):
             unit = next((text for factor, text in _UNITS.items() if _near(ratio, factor)), None)
             kind = "unit" if unit else "size"
-            yield names[i], flag(kind, off > _OTHER_SIZE or bool(unit), ratio=ratio, unit=unit)
+            yield (
+                names[i],
+                flag(kind, off > _IMPLAUSIBLE_SIZE or bool(unit), ratio=ratio, unit=unit),
+            )
 
 
 def _near(ratio, factor):
-    within = 1.4 if max(factor, 1 / factor) > 5 else 1.15  # 2.54 is near what anatomies differ by
+    within = 1.4 if max(factor, 1 / factor) > 5 else 1.15  # 2.54 is near anatomical variation
     return 1 / within < ratio / factor < within
 
 
 def _two_sizes(values):
-    """Those of the smaller of two groups of sizes far apart, of two shapes or more each, (n,)."""
-    odd = np.zeros(len(values), bool)
+    """Mask ``(n,)`` of the smaller of two distinct groups of sizes, of at least two shapes each."""
+    group = np.zeros(len(values), bool)
     if len(values) < 4:
-        return odd
+        return group
     order = np.argsort(values, kind="stable")
     step = np.diff(values[order])
     cut = 1 + int(np.argmax(step))
     low, high = order[:cut], order[cut:]
     within = max(np.ptp(values[low]), np.ptp(values[high]))
-    if min(len(low), len(high)) >= 2 and step[cut - 1] >= max(np.log(_ODD_SIZE), 2 * within):
-        # of as many on both sides the first name stays
-        odd[low if (len(low), 0 in low) < (len(high), 0 in high) else high] = True
-    return odd
+    if min(len(low), len(high)) >= 2 and step[cut - 1] >= max(np.log(_SUSPECT_SIZE), 2 * within):
+        # on a tie, the group of the first name stays
+        group[low if (len(low), 0 in low) < (len(high), 0 in high) else high] = True
+    return group
 
 
-def _different_units(attrs, of_all):
+def _different_units(attrs, remarks):
     for key in ("unit", "coordinate_system"):
-        values = {name: said[key] for name, said in attrs.items() if said.get(key)}
+        values = {name: shape[key] for name, shape in attrs.items() if shape.get(key)}
         if len(set(values.values())) > 1:
-            of_all.append(
-                f"the files name different {key.replace('_', ' ')}s, and none was converted "
+            remarks.append(
+                f"the files have different {key.replace('_', ' ')}s, and none was converted "
                 f"({_names_by(values)})"
             )
 
 
-def _genus(attrs, of_all):
-    genus = {name: said["genus"] for name, said in attrs.items() if "genus" in said}
+def _genus(attrs, remarks):
+    genus = {name: values["genus"] for name, values in attrs.items() if "genus" in values}
     count = Counter(genus.values())
     if len(count) < 2:
         return
-    of_all.append(f"the shapes differ in genus ({_names_by(genus, 'genus ')})")
+    remarks.append(f"the shapes differ in genus ({_names_by(genus, 'genus ')})")
     usual, number = count.most_common(1)[0]
     for name, g in genus.items():
         if g != usual and number > len(genus) / 2:
             yield name, flag("genus", genus=g, usual=usual, number=number, n=len(genus))
 
 
-def _much_more(kind, evidence):
-    """Those with more than the least of a number, and many times the usual of the others."""
+def _much_more(kind, comparisons):
+    """Flags of values above a limit and many times the median of the others."""
     attr, least = _MUCH_MORE_OF[kind]
-    values = np.array([seen.attrs[attr] for seen in evidence.values()])
-    for i, (name, seen) in enumerate(evidence.items()):
+    values = np.array([data.attrs[attr] for data in comparisons.values()])
+    for i, (name, data) in enumerate(comparisons.items()):
         usual = max(float(np.median(np.delete(values, i))), 0.0)
         if values[i] > max(least, _MUCH_MORE * usual):
             percent = {"percent": 100 * values[i], "usual_percent": 100 * usual}
-            number = seen.attrs["self_intersections"]
+            number = data.attrs["self_intersections"]
             yield name, flag(kind, value=values[i], usual=usual, number=number, **percent)
 
 
-def _duplicates(evidence):
-    """Shapes with the same numbers, which no transform, no order of vertices and no format changes.
+def _duplicates(comparisons):
+    """Flags of equal numbers, which do not depend on pose, order of vertices or format.
 
-    A reflection changes the sign of the chirality, which of a symmetric shape is none.
+    A reflection changes the sign of the chirality, which is zero for a symmetric shape.
     """
-    chirality = [seen.attrs["chirality"] for seen in evidence.values()]
-    numbers = np.column_stack([_in_numbers(list(evidence.values())), chirality])
-    names = list(evidence)
-    first: dict[int, int] = {}
+    chirality = [data.attrs["chirality"] for data in comparisons.values()]
+    numbers = np.column_stack([_log_measures(list(comparisons.values())), chirality])
+    names = list(comparisons)
+    copy_of: dict[int, int] = {}
     for i, j in sorted(cKDTree(numbers).query_pairs(SAME, p=np.inf)):
-        first.setdefault(j, i)
-    for j, i in first.items():
+        copy_of.setdefault(j, i)
+    for j, i in copy_of.items():
         is_symmetric = abs(chirality[i] + chirality[j]) < SAME
         mirrored = " (or its mirror image)" if is_symmetric else ""
         yield names[j], flag("duplicate", other=names[i], mirrored=mirrored)
 
 
-def _mirrored(evidence, of_all):
-    """Those of the rarer hand, where the collection has a hand."""
+def _mirrored(comparisons, remarks):
+    """Flags of shapes of the less common side, if the shapes of the collection are chiral."""
     fits = ("fit", "fit_mirrored")
-    names, mean = np.array(list(evidence)), hands(evidence)
+    names, mean = np.array(list(comparisons)), mean_chirality(comparisons)
     fit, fit_mirrored = (
-        np.array([np.nanmedian(seen[way]) for seen in evidence.values()]) for way in fits
+        np.array([np.nanmedian(data[key]) for data in comparisons.values()]) for key in fits
     )
     usual = np.median(np.minimum(fit, fit_mirrored))
     close = (fit_mirrored < CLOSE * usual) | (fit_mirrored < fit / CLOSE)
@@ -581,53 +584,53 @@ def _mirrored(evidence, of_all):
     if np.median(np.abs(mean)) < COMMON_SIDE or not other.any():
         return
     if 2 * other.sum() == len(names):
-        of_all.append(
+        remarks.append(
             f"mirror images of each other, by ICP: {first_of(names[~other], most=6)} and "
-            f"{first_of(names[other], most=6)}; kept as they are"
+            f"{first_of(names[other], most=6)}; none was changed"
         )
     for name in names[other] if len(names) > 2 else ():
-        seen = evidence[name]
-        beside = ~np.isin(seen["reference"].values, names[other])
-        beside |= not beside.any()
-        yield name, flag("mirrored", **{w: np.nanmedian(seen[w].values[beside]) for w in fits})
+        data = comparisons[name]
+        common = ~np.isin(data["reference"].values, names[other])
+        common |= not common.any()
+        yield name, flag("mirrored", **{k: np.nanmedian(data[k].values[common]) for k in fits})
 
 
-def _boundaries(evidence):
-    length = np.array([seen.attrs["open_boundary"] for seen in evidence.values()])
-    for i, (name, more) in enumerate(zip(evidence, excess(length, _BOUNDARY), strict=True)):
-        if more > SPREADS:
+def _boundaries(comparisons):
+    length = np.array([data.attrs["open_boundary"] for data in comparisons.values()])
+    for i, (name, score) in enumerate(zip(comparisons, excess(length, _BOUNDARY), strict=True)):
+        if score > WARNED:
             usual = np.median(np.delete(length, i))
             yield name, flag("partial", value=length[i], usual=usual)
 
 
-def _forms(evidence, told):
-    """Those unlike the others; where something is told already, that may be the reason."""
-    seen = list(evidence.values())
-    fit = np.log([max(float(np.nanmedian(one["fit"])), 1e-9) for one in seen])
-    _, compactness, *moment = _in_numbers(seen).T
-    # of extents: poses change them most, so that they need more
-    extents = np.abs(excess(np.array(moment).T, MOMENT)).max(1) * SPREADS / _EXTENT_SPREADS
-    far = {
+def _forms(comparisons, flags):
+    """Flags of outliers in form; a missing part or a duplicate is reported as such only."""
+    data = list(comparisons.values())
+    fit = np.log([max(float(np.nanmedian(shape["fit"])), 1e-9) for shape in data])
+    _, compactness, *moment = _log_measures(data).T
+    # poses change the extents most, so their limit is higher
+    extents = np.abs(excess(np.array(moment).T, MOMENT)).max(1) * WARNED / _WARNED_EXTENT
+    scores = {
         "its distance from them after alignment is": excess(fit, _FIT),
         "its volume for its area is": np.abs(excess(compactness, COMPACTNESS)),
         "its extents are": extents,
     }
-    for i, name in enumerate(evidence):
-        what = max(far, key=lambda what: far[what][i])
-        spreads = far[what][i]
-        known = any(one.kind in ("partial", "duplicate") for one in told[name])
-        if spreads > SPREADS and not known:
-            yield name, flag("kind", spreads > FAR, what=what, spreads=spreads)
+    for i, name in enumerate(comparisons):
+        what = max(scores, key=lambda what: scores[what][i])
+        deviations = scores[what][i]
+        is_explained = any(flag.kind in ("partial", "duplicate") for flag in flags[name])
+        if deviations > WARNED and not is_explained:
+            yield name, flag("kind", deviations > FLAGGED, what=what, deviations=deviations)
 
 
 def _names_by(values, prefix=""):
-    """The shapes of each value: ``m: a; mm: b, c``."""
+    """Shapes of each value: ``m: a; mm: b, c``."""
     groups = {v: [name for name in values if values[name] == v] for v in set(values.values())}
     return "; ".join(f"{prefix}{v}: {first_of(groups[v], most=6)}" for v in sorted(groups))
 
 
 class Decision(NamedTuple):
-    """What only the user can say of some shapes: the kind of their flags, and what to do."""
+    """Shapes with a kind of flag on which the user must decide, and the remedy."""
 
     kind: str
     names: list[str]
@@ -635,7 +638,7 @@ class Decision(NamedTuple):
 
 
 def _by_kind(kinds):
-    """One decision for each kind, that of most shapes first; `kinds` of a shape are words."""
+    """Decisions, one per kind, sorted by number of shapes; `kinds` of a shape are words."""
     names: dict[str, list[str]] = {}
     for name, words in kinds.items():
         for kind in words.split():
@@ -646,7 +649,7 @@ def _by_kind(kinds):
 
 
 def decisions(report: xr.Dataset, column: str = "flag_kinds") -> list[Decision]:
-    """What is to decide on the flagged shapes of a report, that of most shapes first."""
+    """Decisions on the flagged shapes of a report, sorted by number of shapes."""
     if column not in report:
         return []
     names, words = report["shape"].values.tolist(), report[column].values.tolist()
@@ -654,17 +657,17 @@ def decisions(report: xr.Dataset, column: str = "flag_kinds") -> list[Decision]:
 
 
 def notices(report: xr.Dataset) -> list[Decision]:
-    """What else looks wrong with shapes, and makes none of them flagged."""
+    """Warnings of a report that do not flag a shape."""
     return decisions(report, "warning_kinds")
 
 
 def flagged_lines(kinds: dict[str, str]) -> list[str]:
-    """A line for each kind: how many shapes, which, what to do.
+    """Format a line per kind: number of shapes, names, remedy.
 
     Parameters
     ----------
     kinds : dict of str to str
-        Name of a shape -> the kinds of its flags, with blanks between them.
+        Name of a shape -> the kinds of its flags, separated by blanks.
 
     Examples
     --------
@@ -673,13 +676,13 @@ def flagged_lines(kinds: dict[str, str]) -> list[str]:
     ['2 unit: a, b (scale the files to the unit of the others)']
     """
     return [
-        f"{len(one.names)} {one.kind}: {listed(one.names, 50)} ({one.remedy})"
-        for one in _by_kind(kinds)
+        f"{len(decision.names)} {decision.kind}: {listed(decision.names, 50)} ({decision.remedy})"
+        for decision in _by_kind(kinds)
     ]
 
 
-def listed(names: Sequence[str], room: int, longest: int = 24) -> str:
-    """As many names as the room has letters, one at least, and how many more there are.
+def listed(names: Sequence[str], width: int, longest: int = 24) -> str:
+    """List as many names as fit in `width` characters, at least one, and the number of others.
 
     Examples
     --------
@@ -689,14 +692,14 @@ def listed(names: Sequence[str], room: int, longest: int = 24) -> str:
     """
     names = shortened(names, longest)
     text, shown = ", ".join(names), len(names)
-    while len(text) > room and shown > 1:
+    while len(text) > width and shown > 1:
         shown -= 1
         text = ", ".join([*names[:shown], f"{len(names) - shown} more"])
     return text
 
 
 def shortened(texts: Iterable[str], longest: int) -> list[str]:
-    """Texts of at most so many letters; of a longer one the middle is left out.
+    """Shorten texts to at most `longest` characters by omitting the middle.
 
     Examples
     --------

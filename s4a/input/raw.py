@@ -1,6 +1,6 @@
-"""Files as bytes (5, the data): regular ones of bounded size, and containers that stay bounded.
+"""Read untrusted files (5, the data): regular files and containers of bounded size.
 
-Gzip, NPZ, NPY and XML that cannot fill the memory or run anything; names and texts as shown.
+Gzip, NPZ, NPY and XML are read without filling the memory or running code.
 """
 
 import codecs
@@ -23,8 +23,8 @@ from xml.parsers import expat
 
 import numpy as np
 
-LARGEST_FILE = 2**31  # bytes that are read of one file: 50 million vertices and their triangles
-CHUNK = 2**20  # bytes that are read at a time
+LARGEST_FILE = 2**31  # bytes of a file: 50 million vertices and their triangles
+CHUNK = 2**20  # bytes read at a time
 _OTHER_KINDS = {
     stat.S_IFIFO: "a named pipe",
     stat.S_IFSOCK: "a socket",
@@ -32,32 +32,32 @@ _OTHER_KINDS = {
     stat.S_IFBLK: "a device",
     stat.S_IFDIR: "a folder",
 }
-_WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # of Excel or LibreOffice, new and old
+_WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # Excel or LibreOffice, new and old
 
 _AnyPath = str | os.PathLike[str]
 
 
 @contextmanager
 def regular_file(path: _AnyPath) -> Iterator[BinaryIO]:
-    """A regular file, open for reading.
+    """Open a regular file for reading.
 
-    A pipe would let a run wait for ever, and a device fill the memory.
+    Pipes, on which a run would wait, and devices, which could fill the memory, are refused.
 
     Raises
     ------
     ValueError
-        When it is something else, or cannot be opened or read; the file is not named.
+        If the path is not a regular file, or cannot be read; the message does not name the file.
     """
     try:
-        _check_regular(os.stat(path))  # before it is opened, as that can set a device in transform
+        _check_regular(os.stat(path))  # before opening, which can have effects on a device
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
         with open(os.open(path, flags), "rb") as file:
-            _check_regular(os.fstat(file.fileno()))  # something else may have come in its place
+            _check_regular(os.fstat(file.fileno()))  # the path may have been replaced
             yield file
     except OSError as error:
         if isinstance(error, FileNotFoundError) and os.path.islink(path):
             raise ValueError(
-                f"a file expected, found a link to {shown(os.readlink(path))}, which is not there"
+                f"a file expected, found a broken link to {shown(os.readlink(path))}"
             ) from error
         raise ValueError(f"it cannot be opened or read: {error.strerror or error}") from error
 
@@ -65,7 +65,7 @@ def regular_file(path: _AnyPath) -> Iterator[BinaryIO]:
 def _check_regular(status):
     kind = stat.S_IFMT(status.st_mode)
     if kind != stat.S_IFREG:
-        raise ValueError(f"a regular file expected, found {_OTHER_KINDS.get(kind, 'another kind')}")
+        raise ValueError(f"a regular file expected, found {_OTHER_KINDS.get(kind, 'another type')}")
     _check_size(status.st_size)
 
 
@@ -77,29 +77,29 @@ def _check_size(size):
 
 
 def check_there(path: _AnyPath) -> None:
-    """ValueError where nothing has this name, not even a link that leads nowhere."""
+    """Raise ValueError if the path does not exist, not even as a broken link."""
     try:
         os.lstat(path)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise ValueError(f"no file {shown(path)}") from error
-    except OSError:  # why it cannot be read is said when it is opened
+    except OSError:  # opening the file will raise the error
         pass
 
 
 @contextmanager
 def reading(path: _AnyPath, what: str) -> Iterator[None]:
-    """Whatever is wrong with a file, a ValueError that names it and `what` it was read as."""
+    """Turn any error into a ValueError that names the file and `what` it was read as."""
     try:
         yield
-    except Exception as error:  # whatever a file holds, it must not end the run over a collection
+    except Exception as error:  # no file may end the run over a collection
         why = shown(error) or type(error).__name__
         raise ValueError(f"{shown(path)} cannot be read as {what}: {why}") from error
 
 
 def read_all(file: BinaryIO) -> bytes:
-    """The bytes of an open file, :data:`LARGEST_FILE` at most.
+    """Read the bytes of an open file, at most :data:`LARGEST_FILE`.
 
-    The size is looked at while it is read, as a file can grow, or say that it has no bytes.
+    The size is checked while reading, as the file may grow or report a size of 0.
     """
     data = io.BytesIO()
     while part := file.read(CHUNK):
@@ -109,15 +109,15 @@ def read_all(file: BinaryIO) -> bytes:
 
 
 def read_bytes(path: _AnyPath) -> bytes:
-    """The bytes of a regular file; ValueError where there is none, see :func:`regular_file`."""
+    """Read the bytes of a regular file, or ValueError, see :func:`regular_file`."""
     with regular_file(path) as file:
         return read_all(file)
 
 
 def shown(text: object) -> str:
-    r"""A path or a text with what cannot be printed written as escapes.
+    r"""Escape unprintable characters of a path or a text.
 
-    So that no name writes a line of its own, colours a terminal or turns the direction of writing.
+    No file name can add a line, colour a terminal or change the direction of writing.
 
     Examples
     --------
@@ -130,12 +130,12 @@ def shown(text: object) -> str:
 
 
 def text_of(data: bytes) -> str:
-    """The text of a file in UTF-8, with or without a mark at its start.
+    """Decode the text of a file in UTF-8, with or without a byte order mark.
 
     Raises
     ------
     ValueError
-        When it is none; the message says what it seems to be, and what to do.
+        If the file is not UTF-8; the message says what it seems to be, and the remedy.
 
     Examples
     --------
@@ -152,8 +152,8 @@ def text_of(data: bytes) -> str:
     if b"\0" in data:
         line = 1 + data[: data.index(b"\0")].count(b"\n")
         raise ValueError(
-            f"text expected, found the byte 0 in line {line}: it seems to be a binary or a damaged "
-            "file; export it again"
+            f"text expected, found the byte 0 in line {line}: the file seems to be binary or "
+            "damaged; export it again"
         )
     try:
         return data.decode("utf-8-sig")
@@ -168,20 +168,20 @@ def text_of(data: bytes) -> str:
 
 
 def _every_other_is_nul(data):
-    """Whether it looks like UTF-16 without a mark, of mostly Latin letters."""
+    """Whether data seem to be UTF-16 without a mark, of mostly Latin letters."""
     head = data[:1000]
     shares = sorted(half.count(0) / max(len(half), 1) for half in (head[::2], head[1::2]))
     return len(head) > 1 and shares[0] < 0.1 and shares[1] > 0.6
 
 
 LARGEST = 2**30  # bytes that a file may unpack to: 30 million vertices and their triangles
-LEAST = 2**26  # unpacked size that is never refused
-_RATIO = 200  # times the size of the file that it may unpack to beyond that
+LEAST = 2**26  # unpacked size that is always accepted
+_RATIO = 200  # largest ratio of unpacked to packed size beyond that
 _GZIP = b"\x1f\x8b"
 
 
 def limit_of(size: int, least: int = LEAST) -> int:
-    """Most bytes that a file of `size` bytes may unpack to; `least` are never refused.
+    """Largest unpacked size of a file of `size` bytes; `least` bytes are always accepted.
 
     Examples
     --------
@@ -193,20 +193,19 @@ def limit_of(size: int, least: int = LEAST) -> int:
 
 
 def check(unpacked: int, size: int, least: int = LEAST) -> None:
-    """ValueError when `unpacked` bytes are more than a file of `size` bytes may hold."""
+    """Raise ValueError if `unpacked` exceeds the :func:`limit_of` a file of `size` bytes."""
     limit = limit_of(size, least)
     if unpacked > limit:
         raise ValueError(
             f"at most {limit / 2**20:.0f} MiB expected in {size} compressed bytes, "
-            "found more: unpack the file yourself if you trust it"
+            "found more: unpack the file if you trust it"
         )
 
 
 def gunzip(file: BinaryIO, least: int = LEAST) -> bytes:
-    """The bytes of a gzip file (several members too); ValueError if too many, or it ends early.
+    """Unpack a gzip file, with one or several members; ValueError if it is too large or truncated.
 
-    What was unpacked is held against what was read for it so far, so that little memory is taken
-    before too much is refused.
+    The unpacked size is compared with the bytes read so far, to stop early.
 
     Examples
     --------
@@ -223,14 +222,14 @@ def gunzip(file: BinaryIO, least: int = LEAST) -> bytes:
                 unpacked.write(part)
                 check(unpacked.tell(), file.tell(), least)
     except EOFError as error:
-        raise ValueError(f"the gzip data ends early: found {file.tell()} bytes") from error
+        raise ValueError(f"the gzip data is truncated: found {file.tell()} bytes") from error
     except (OSError, zlib.error) as error:
         raise ValueError(f"damaged gzip data ({error})") from error
     return unpacked.getvalue()
 
 
 def content(path: Path | str, least: int = LEAST) -> bytes:
-    """The bytes of a regular file, unpacked where it is compressed by gzip."""
+    """Read the bytes of a regular file, and unpack them if they are gzip."""
     with regular_file(path) as file:
         is_packed = file.read(len(_GZIP)) == _GZIP
         file.seek(0)
@@ -238,14 +237,14 @@ def content(path: Path | str, least: int = LEAST) -> bytes:
 
 
 def unpack(data: bytes, compressor: str, limit: int) -> bytes:
-    """The bytes of one stream, `limit` at most: of ``"zlib"`` or ``"lzma"``."""
+    """Unpack one stream of ``"zlib"`` or ``"lzma"``, at most `limit` bytes."""
     by_lzma = compressor == "lzma"
     stream: Any = lzma.LZMADecompressor(memlimit=2**28) if by_lzma else zlib.decompressobj()
     unpacked = io.BytesIO()
-    step = 2**16  # bytes that are taken in at a time
+    step = 2**16  # packed bytes at a time
     for start in range(0, len(data), step):
         part, packed = b"", data[start : start + step]
-        while packed or len(part) == CHUNK:  # there may be more of what was taken in
+        while packed or len(part) == CHUNK:  # there may be more output
             part = stream.decompress(packed, CHUNK)
             packed = b"" if by_lzma else stream.unconsumed_tail
             unpacked.write(part)
@@ -254,11 +253,11 @@ def unpack(data: bytes, compressor: str, limit: int) -> bytes:
                 raise ValueError(f"at most {most} bytes expected in a compressed block, found more")
             if stream.eof:
                 return unpacked.getvalue()
-    raise ValueError(f"a compressed block ends early: found {len(data)} bytes")
+    raise ValueError(f"a compressed block is truncated: found {len(data)} bytes")
 
 
 def xml(text: bytes | str) -> ElementTree.Element:
-    """The root of an XML file; ValueError for entities, which could grow or name other files.
+    """Parse XML and return the root; ValueError for entities, which can expand or read files.
 
     Examples
     --------
@@ -282,10 +281,7 @@ def xml(text: bytes | str) -> ElementTree.Element:
 
 
 def npz(data: bytes) -> dict[str, Callable[[], np.ndarray]]:
-    """The arrays of an NPZ archive: their names, and for each a function that reads it.
-
-    ValueError where it holds too much.
-    """
+    """Return a reader for each array of an NPZ archive by name; ValueError if too large."""
     archive = zipfile.ZipFile(io.BytesIO(data))
     members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
     check(sum(member.file_size for member in members.values()), len(data))
@@ -294,9 +290,9 @@ def npz(data: bytes) -> dict[str, Callable[[], np.ndarray]]:
 
 def _read_member(archive, member):
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError("arrays expected that are stored or deflated, as NumPy writes them")
+        raise ValueError("stored or deflated arrays expected, as NumPy writes them")
     with archive.open(member) as stream:
-        return npy(stream.read(member.file_size))  # no more, even where the archive lies about it
+        return npy(stream.read(member.file_size))  # no more, even if the size is wrong
 
 
 NPY = re.compile(
@@ -306,7 +302,7 @@ NPY = re.compile(
 
 
 def npy(data: bytes) -> np.ndarray:
-    """The array of a NPY file of numbers or text; nothing in the file is evaluated or unpickled.
+    """Read an NPY file of numbers or text, without evaluating or unpickling anything.
 
     Examples
     --------
@@ -319,14 +315,14 @@ def npy(data: bytes) -> np.ndarray:
     [[1, 2], [3, 4]]
     """
     if not data.startswith(b"\x93NUMPY") or data[6:8] not in (b"\1\0", b"\2\0"):
-        raise ValueError("an array of NumPy's format 1.0 or 2.0 expected, found something else")
+        raise ValueError("an array in NumPy's format 1.0 or 2.0 expected")
     width = 2 * data[6]
     start = 8 + width + int.from_bytes(data[8 : 8 + width], "little")
     header = NPY.fullmatch(data, 8 + width, start)
     if not header:
         text = data[8 + width : start].strip()[:100]
         raise ValueError(
-            "an array of numbers or text expected, and no pickled objects; "
+            "an array of numbers or text, without pickled objects, expected; "
             f"found the header {text!r}"
         )
     dtype = np.dtype(header[1].decode())

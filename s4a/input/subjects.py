@@ -1,4 +1,4 @@
-"""Covariates and groups of the shapes (6.1): a table on which only the statistics depend."""
+"""Tables of covariates and groups of the shapes (6.1), for the statistics."""
 
 import logging
 import re
@@ -26,57 +26,57 @@ def _head_and_rows(path):
     head = rows.pop(next(iter(rows)))
     if "shape" not in head:
         raise ValueError(
-            f"{path}: a column 'shape' with the names or files of the shapes needed; found {head}"
+            f"{path}: a column 'shape' with names or files of the shapes needed; found {head}"
         )
     wrong = [name for name in head if not name or "/" in name or head.count(name) > 1]
     if wrong:
         raise ValueError(
-            f"{path}: columns need names of their own without '/'; found {wrong[0]!r} in {head}"
+            f"{path}: columns need unique names without '/'; found {wrong[0]!r} in {head}"
         )
     ragged = [(line, row) for line, row in rows.items() if len(row) != len(head)]
     if ragged:
         line, row = ragged[0]
         raise ValueError(
-            f"{path}: {len(head)} cells in every row needed; line {line} has {len(row)}"
+            f"{path}: {len(head)} cells in every row needed; found {len(row)} in line {line}"
         )
     return head, list(rows.values())
 
 
 def _shape_of(cell, names):
-    """The shape that a cell names, by its name or its file; the cell itself where there is none."""
+    """Shape that a cell names, by its name or its file; the cell itself if there is none."""
     *folders, file = Path(cell).parts or [""]
-    ends = [[*folders[i:], stem_of(file)] for i in range(len(folders) + 1)]  # names of shapes are
-    known = (cell, slug(cell), *(slug("/".join(end)) for end in ends))  # of folders, too, if needed
-    return next((name for name in known if name in names), cell)
+    # names of shapes may begin with the names of their folders
+    ends = [[*folders[i:], stem_of(file)] for i in range(len(folders) + 1)]
+    candidates = (cell, slug(cell), *(slug("/".join(end)) for end in ends))
+    return next((name for name in candidates if name in names), cell)
 
 
 def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
-    """Covariates and groups from a file.
+    """Read a table of covariates and groups.
 
     Parameters
     ----------
     path : path
-        CSV with a header, separated by commas, semicolons or tabs, a row per shape; the column
+        CSV with a header, separated by commas, semicolons or tabs, with a row per shape; the column
         ``shape`` has the name of the shape, or its file with or without folders.  A row without
         a shape is ignored; all values of a shape without a row are missing.  A warning names both.
     names : list of str
-        The shapes.
+        Names of the shapes.
 
     Returns
     -------
     Dataset
-        A variable over ``shape`` for every other column, in the order of `names`: whole numbers;
-        numbers, NaN where a value is missing; or text, empty where one is missing.  Missing is an
-        empty cell, ``NA``, ``n/a``, ``NaN``, ``-`` or ``null``, in letters of any size.  A column
-        that is mostly numbers but not all, as with ``?`` or decimal commas, is kept as text with a
-        warning, and no test takes it.  So is one in which different digits would be one number, as
-        ``01`` and ``1`` or two of 17 digits: they tell subjects apart.
+        A variable over ``shape`` for every other column, in the order of `names`: integers;
+        numbers, with NaN for missing values; or text, empty for missing values.  Missing values are
+        empty cells, ``NA``, ``n/a``, ``NaN``, ``-`` or ``null``, in upper or lower case.  A column
+        with some cells that are not numbers, as ``?`` or decimal commas, stays text with a warning,
+        and tests do not use it.  A column also stays text if different digits would give the same
+        number, as ``01`` and ``1``: they are identifiers.
 
     Raises
     ------
     ValueError
-        When the file is not such a table, has two rows for a shape, or none for all; shapes and
-        columns are named.
+        If the file is not such a table, has two rows for a shape, or no row for any shape.
 
     Examples
     --------
@@ -94,21 +94,21 @@ def read_table(path: Path | str, names: list[str]) -> xr.Dataset:
         column: _values([cells[name][column] for name in names]) for column in cells[names[0]]
     }
     if not columns:
-        raise ValueError(f"{path}: a column beside 'shape' needed, found none")
+        raise ValueError(f"{path}: a column in addition to 'shape' needed, found none")
     for name, values in columns.items():
         if values.dtype.kind == "f" and np.isinf(values).any():
             raise ValueError(
                 f"{path}: finite numbers, or nothing, needed in the column {name!r}; found {np.inf}"
             )
-        if odd := odd_cells(values.tolist()) if values.dtype.kind == "U" else []:
-            log.warning("%s: the column %r %s", path, name, odd_words(odd, names, values))
+        if rows := non_numeric_cells(values.tolist()) if values.dtype.kind == "U" else []:
+            log.warning("%s: the column %r %s", path, name, non_numeric_text(rows, names, values))
         if _PERSON.fullmatch(name):
             _report_repeated(path, name, values, names)
     return subjects(columns, names, str(path))
 
 
 def read_cells(path: Path | str, names: Sequence[str]) -> dict[str, dict[str, str]]:
-    """The cells of a table as text, by shape and column; see :func:`read_table`."""
+    """Read the cells of a table as text, by shape and column; see :func:`read_table`."""
     head, rows = _head_and_rows(path)
     row_of: dict[str, dict[str, str]] = {}
     for row in rows:
@@ -133,11 +133,11 @@ def read_cells(path: Path | str, names: Sequence[str]) -> dict[str, dict[str, st
 
 
 def _values(cells):
-    """Integers, floats or strings, whatever all cells are."""
-    known = [c for c in cells if not is_missing(c)]
-    digits = {c for c in known if c.lstrip("+-").isdigit()}
-    are_numbers = bool(known) and all(map(is_plain_number, known))
-    # 01 and 1, or of more digits than a number, would become one
+    """Integers or floats if all cells are, else strings."""
+    present = [c for c in cells if not is_missing(c)]
+    digits = {c for c in present if c.lstrip("+-").isdigit()}
+    are_numbers = bool(present) and all(map(is_plain_number, present))
+    # 01 and 1, or numbers of 17 digits, would become equal
     if not are_numbers or len({float(c) for c in digits}) < len(digits):
         return np.array(["" if is_missing(c) else c for c in cells])
     numbers = np.array([np.nan if is_missing(c) else float(c) for c in cells])
@@ -146,22 +146,22 @@ def _values(cells):
 
 
 def _report_repeated(path, column, values, names):
-    """Say which shapes are of one person: the tests take all shapes as independent."""
+    """Warn about several shapes of one person: tests assume independent shapes."""
     shapes_of = {}
     for name, value in zip(names, values.tolist(), strict=True):
         if not is_missing(str(value)):
             shapes_of.setdefault(value, []).append(name)
-    again = [f"{value}: {', '.join(of)}" for value, of in shapes_of.items() if len(of) > 1]
-    if again:
+    repeated = [f"{value}: {', '.join(s)}" for value, s in shapes_of.items() if len(s) > 1]
+    if repeated:
         log.warning(
-            f"{path}: {len(again)} values of the column {column!r} stand for several shapes "
-            f"({listed(again, '; ')}); the tests take all shapes as independent, so keep one of "
-            "each, or their mean, or take growth"
+            f"{path}: {len(repeated)} values of the column {column!r} have several shapes "
+            f"({listed(repeated, '; ')}); tests assume independent shapes: keep one shape of each, "
+            "or use the analysis of growth"
         )
 
 
 def is_missing(cell: str) -> bool:
-    """Whether a cell says that a value is not known.
+    """Return whether a cell stands for a missing value.
 
     Examples
     --------
@@ -173,39 +173,41 @@ def is_missing(cell: str) -> bool:
 
 
 def is_plain_number(cell: str) -> bool:
-    """Whether a cell is a number as tables write it: Python's 1_000 is none."""
+    """Return whether a cell is a number; 1_000, a number in Python, is not."""
     return is_number(cell) and "_" not in cell
 
 
-def odd_cells(cells: Sequence[str]) -> list[int]:
-    """Places of what is no number in a column that is mostly numbers; none in other columns.
+def non_numeric_cells(cells: Sequence[str]) -> list[int]:
+    """Rows of cells that are not numbers, in a column of mostly numbers; else an empty list.
 
-    Numbers with a decimal comma count as meant as numbers, and are odd.
+    Numbers with a decimal comma count as numbers for "mostly", and are returned.
 
     Examples
     --------
-    >>> from s4a.input.subjects import odd_cells
-    >>> odd_cells(["31", "?", "NA", "42"]), odd_cells(["60,5", "61,0"]), odd_cells(["a1", "b2"])
-    ([1], [0, 1], [])
+    >>> from s4a.input.subjects import non_numeric_cells
+    >>> non_numeric_cells(["31", "?", "NA", "42"]), non_numeric_cells(["60,5", "61,0"])
+    ([1], [0, 1])
+    >>> non_numeric_cells(["a1", "b2"])
+    []
     """
-    known = [i for i, cell in enumerate(cells) if not is_missing(cell)]
-    meant = [i for i in known if is_plain_number(cells[i].replace(",", "."))]
-    odd = [i for i in known if not is_plain_number(cells[i])]
-    return odd if 2 * len(meant) > len(known) else []
+    present = [i for i, cell in enumerate(cells) if not is_missing(cell)]
+    like_numbers = [i for i in present if is_plain_number(cells[i].replace(",", "."))]
+    rows = [i for i in present if not is_plain_number(cells[i])]
+    return rows if 2 * len(like_numbers) > len(present) else []
 
 
-def odd_words(odd: Sequence[int], names: Sequence[str], cells: Sequence[str]) -> str:
-    """What is wrong with a column that has :func:`odd_cells`, and what to do."""
-    found = listed([f"{names[i]}: {str(cells[i])!r}" for i in odd])
+def non_numeric_text(rows: Sequence[int], names: Sequence[str], cells: Sequence[str]) -> str:
+    """Describe a column with :func:`non_numeric_cells`, and the remedy."""
+    found = listed([f"{names[i]}: {str(cells[i])!r}" for i in rows])
     return (
-        f"is mostly numbers, but {len(odd)} of its {len(cells)} cells are none ({found}): write "
-        "numbers with a decimal point and without unit, and NA where one is not known; or words in "
-        "every cell, where they are names of groups"
+        f"is mostly numbers, but {len(rows)} of {len(cells)} cells are not ({found}): write "
+        "numbers with a decimal point and without unit, and NA for missing values; or text in "
+        "every cell, if they are names of groups"
     )
 
 
 def listed(texts: Sequence[str], mark: str = ", ", most: int = 5) -> str:
-    """The first of them, and how many more there are.
+    """List the first texts, and the number of others.
 
     Examples
     --------
@@ -220,7 +222,7 @@ def listed(texts: Sequence[str], mark: str = ", ", most: int = 5) -> str:
 def subjects(
     columns: Mapping[str, ArrayLike], names: Sequence[str], path: Path | str = ""
 ) -> xr.Dataset:
-    """The Dataset ``/subjects`` of columns, a dict of name to values in the order of the shapes."""
+    """Make ``/subjects`` from columns, a dict of name to values in the order of the shapes."""
     wrong = [n for n, values in columns.items() if np.shape(values) != (len(names),)]
     if wrong:
         raise ValueError(f"column {wrong[0]!r} needs a value for each of {len(names)} shapes")
@@ -229,11 +231,8 @@ def subjects(
 
 
 def with_table(study: xr.DataTree, path: Path | str) -> xr.DataTree:
-    """A study with ``/subjects`` read from a file.
-
-    The tables are shared, the study given stays as it is.
-    """
-    listed = study["report" if "report" in study else "registration"].to_dataset()
-    names = listed["shape"].values.tolist()
+    """Return a study with ``/subjects`` read from a file; the study given is not changed."""
+    shapes = study["report" if "report" in study else "registration"].to_dataset()["shape"]
+    names = shapes.values.tolist()
     nodes = {n.path: n.to_dataset(inherit=False) for n in study.subtree if n.path != "/subjects"}
     return xr.DataTree.from_dict(nodes | {"/subjects": read_table(path, names)}, name=study.name)

@@ -409,8 +409,8 @@ class Study:
 
     def __contains__(self, node: str) -> bool:
         stage, _, name = node.partition("/")
-        parent = self.tree.children.get(stage)
-        return parent is not None and (not name or name in parent.children)
+        shapes = self.tree.children.get(stage)
+        return shapes is not None and (not name or name in shapes.children)
 
     def __getitem__(self, node: str) -> xr.Dataset:
         return self.tree[node].to_dataset()

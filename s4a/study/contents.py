@@ -1,7 +1,7 @@
-"""What each file of a study holds (4), by the schema, and how the files of one study fit together.
+"""Check the files of a study (4) against the schema and against each other.
 
-A file may be of a stranger, of another version or by hand.  What the steps and the pictures take
-from it is checked when it is opened; no larger variable is read for that.
+Files may be untrusted, of another version or edited.  They are checked when they are opened,
+without reading larger variables.
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from s4a.input.files import slug
 from s4a.schema import HOLDS, POINTS_INTO, TABLE, TEXTS
 
 SIZES = {"xyz": 3, "xyz_2": 3, "corner": 3, "end": 2}
-# a dim of a file, and the file and its dim of the same size; {template} is that of registration
+# kind of file -> (dim, other file, dim of the same size there); {template} is that of registration
 FIT = {
     "coarse/shape": [("original_vertex", "original/{shape}", "vertex")],
     "registration": [
@@ -31,7 +31,7 @@ FIT = {
 
 
 def kind_of(name: str) -> str:
-    """The row of :data:`s4a.schema.HOLDS` for a file of this name.
+    """Return the key in :data:`s4a.schema.HOLDS` for the name of a file.
 
     Examples
     --------
@@ -46,12 +46,12 @@ def kind_of(name: str) -> str:
 
 
 def check_contents(name: str, data: xr.Dataset) -> None:
-    """ValueError unless a file has the variables and attributes that a file of its name has.
+    """Raise ValueError unless a file has the variables and attributes of its kind.
 
     Parameters
     ----------
     name : str
-        As ``coarse/brain_01``: its path in the folder of the study, without the suffix.
+        Path in the folder of the study without the suffix, as ``coarse/brain_01``.
     data : Dataset
         Of :func:`s4a.study.netcdf.open_file`.
 
@@ -62,42 +62,42 @@ def check_contents(name: str, data: xr.Dataset) -> None:
     >>> check_contents("pca", dataset(score=[[1.0]]))
     Traceback (most recent call last):
     ...
-    ValueError: it lacks shape, mean_displacement, deformation, ...
+    ValueError: missing variables shape, mean_displacement, deformation, ...
     """
     kind = kind_of(name)
     if kind not in HOLDS:
-        raise ValueError("no file of a study has this name")
+        raise ValueError("not the name of a file of a study")
     if kind == "coarse/shape" and data.attrs.get("method") == "scalable":
         kind = "coarse/scalable"
     needed, texts, numbers = (words.split() for words in HOLDS[kind])
     check_names(data)
-    missing = [one for one in needed if one not in data.variables]
+    missing = [variable for variable in needed if variable not in data.variables]
     if missing:
-        raise ValueError(f"it lacks {', '.join(missing)}")
+        raise ValueError(f"missing variables {', '.join(missing)}")
     for attrs, kinds, what in ((texts, str, "text"), (numbers, (int, float), "number")):
         wrong = [attr for attr in attrs if not isinstance(data.attrs.get(attr), kinds)]
         if wrong:
             raise ValueError(
                 f"the attribute {wrong[0]} needs a {what}, found {data.attrs.get(wrong[0])!r:.40}"
             )
-    for one, values in data.variables.items():
+    for variable, values in data.variables.items():
         if kind != "subjects":
-            check_variable(str(one), values, str(one) in needed)
+            check_variable(str(variable), values, str(variable) in needed)
         elif values.dims != ("shape",):
-            raise ValueError(f"the column {one} needs the dim shape, found {values.dims}")
+            raise ValueError(f"the column {variable} needs the dim shape, found {values.dims}")
     for dim, size in data.sizes.items():
         if SIZES.get(str(dim), size) != size:
             raise ValueError(f"{dim} needs {SIZES[str(dim)]} entries, found {size}")
 
 
 def check_variable(name: str, values: xr.Variable, needed: bool) -> None:
-    """ValueError unless a variable has the dims of the table and, where needed, is of its kind."""
+    """Raise ValueError unless a variable has the dims and, if needed, the type of the schema."""
     is_coordinate = name in values.dims
     if not is_coordinate and name not in TABLE:
-        raise ValueError(f"no variable of a study is called {name}")
+        raise ValueError(f"{name} is not a variable of a study")
     dims = (name,) if is_coordinate else TABLE[name][0]
-    of_one = dims[1:] if dims[0:1] in (("shape",), ("pair",)) and not is_coordinate else dims
-    if values.dims not in (dims, of_one):
+    of_shape = dims[1:] if dims[0:1] in (("shape",), ("pair",)) and not is_coordinate else dims
+    if values.dims not in (dims, of_shape):
         raise ValueError(f"{name} needs the dims {dims}, found {values.dims}")
     kinds, what = "iuf", "numbers"
     if name in TEXTS:
@@ -109,13 +109,13 @@ def check_variable(name: str, values: xr.Variable, needed: bool) -> None:
 
 
 def check_names(data: xr.Dataset) -> None:
-    """ValueError where a shape or stage is there twice, or a name would lead out of the folder."""
+    """Raise ValueError if a shape or stage is repeated, or a name could leave the folder."""
     for name in ("shape", "stage"):
         if name in data.coords:
-            each, counts = np.unique(data.coords[name].values.astype(str), return_counts=True)
+            unique, counts = np.unique(data.coords[name].values.astype(str), return_counts=True)
             if (counts > 1).any():
-                twice = each[counts > 1].tolist()
-                raise ValueError(f"{name} needs names that differ, found {twice} more than once")
+                repeated = unique[counts > 1].tolist()
+                raise ValueError(f"{name} needs unique names, found {repeated} more than once")
     names = [str(data.attrs[attr]) for attr in ("template", "median") if attr in data.attrs]
     names += str(data.attrs.get("excluded", "")).split()
     names += data.coords["shape"].values.astype(str).tolist() if "shape" in data.coords else []
@@ -125,7 +125,7 @@ def check_names(data: xr.Dataset) -> None:
 
 
 def check_fit(name: str, data: xr.Dataset, others: Mapping[str, xr.Dataset]) -> None:
-    """ValueError where a file does not fit to those of the study that it was made from.
+    """Raise ValueError if the sizes of a file do not match those of the files it was made from.
 
     Parameters
     ----------
@@ -133,12 +133,12 @@ def check_fit(name: str, data: xr.Dataset, others: Mapping[str, xr.Dataset]) -> 
         As in :func:`check_contents`.
     data : Dataset
     others : dict of str to Dataset
-        By name, those that were read before.
+        Files that were read before, by name.
     """
     template = others.get("registration", data).attrs.get("template", "")
-    for dim, place, of_place in FIT.get(kind_of(name), ()):
-        other = place.format(shape=name.partition("/")[2], template=template)
+    for dim, pattern, other_dim in FIT.get(kind_of(name), ()):
+        other = pattern.format(shape=name.partition("/")[2], template=template)
         if other in others and dim in data.sizes:
-            size, found = others[other].sizes[of_place], data.sizes[dim]
-            if size != found:
-                raise ValueError(f"{dim} needs {size} entries as in {other}, found {found}")
+            expected, size = others[other].sizes[other_dim], data.sizes[dim]
+            if expected != size:
+                raise ValueError(f"{dim} needs {expected} entries as in {other}, found {size}")

@@ -1,4 +1,4 @@
-"""New shapes in a finished study, which stays as it is (4.2, 6.1): read, placed, registered."""
+"""Out-of-sample shapes (4.2, 6.1): insert new shapes into a finished study."""
 
 import logging
 from pathlib import Path
@@ -37,23 +37,20 @@ log = logging.getLogger(__name__)
 
 
 class Frozen(NamedTuple):
-    """What new shapes need of a study: the template, and its network, the template first.
-
-    Of a study in files, meshes and latent bases are read where a new shape needs them.
-    """
+    """Template and network of a study; meshes and latent bases are read when they are used."""
 
     template: Shape
     nodes: Study  # coarse meshes, latent bases, and rotations onto the template
-    names: list[str]
+    names: list[str]  # the template first
 
 
 class Inserted(NamedTuple):
-    """What is made of one new shape."""
+    """Results for one new shape."""
 
     coarse: xr.Dataset
     Y: np.ndarray  # (k, m), latent basis
     registration: xr.Dataset
-    look: xr.Dataset | None  # None where it was not compared
+    comparison: xr.Dataset | None  # None if not compared
 
 
 def insert(
@@ -65,12 +62,13 @@ def insert(
     compare: bool = True,
     n_jobs: int | None = None,
 ) -> xr.DataTree:
-    """New shapes placed into a finished study, which stays as it is, with its options.
+    """Insert new shapes into a finished study, which is not changed.
 
-    Each new shape is remeshed, aligned and mapped to the template and the five shapes of the study
-    with the most alike spectra; its latent basis solves eq. 3 with theirs frozen; it is registered
-    to the frozen template, and its displacement measured along the frozen modes.  What comes out
-    for one shape does not depend on the others given.
+    Each new shape is remeshed, aligned, and mapped to the template and to the five shapes of the
+    study with the most similar spectra.  The latent basis of the new shape solves eq. 3 with
+    their bases fixed.  The shape is then registered to the template, and the displacement is
+    projected onto the modes of variation of the study.  The result for a shape does not depend on
+    the other new shapes.
 
     Parameters
     ----------
@@ -79,32 +77,35 @@ def insert(
     shapes : path, list of paths, dict or Dataset
         See :func:`s4a.read_shapes`; a single mesh Dataset is named ``new``.
     landmarks : path, optional
-        Folder with a file of landmarks for some or all of them, see :func:`s4a.analyse`.
+        Folder with landmark files, see :func:`s4a.analyse`.
     reflect : str or list of str, optional
-        New shapes to mirror, as ``reflect=`` of :func:`s4a.analyse` did it: their names, with
-        commas between them, or ``"auto"``, those of the other hand than the shapes of the study as
-        they are in it.  Without it none is mirrored, and `compare` tells those of the other hand.
+        Names of new shapes to mirror, separated by commas, or ``"auto"`` for those of the other
+        side than the study.  By default none is mirrored.
     compare : bool
-        Whether each new shape is compared with those of the study: unit, mean_chirality, pose,
-        genus, as :func:`s4a.read_shapes` does it; what looks wrong is named in ``/report`` and left
-        as it is.
+        Compare each new shape with the study in unit, chirality, form and genus, and warn about
+        suspect ones in ``/report``.
     n_jobs : int, optional
-        As in joblib; the result does not depend on it.
+        Processes, as in joblib; the result does not depend on it.
 
     Returns
     -------
     DataTree
-        As a study of the new shapes alone: ``/original``, ``/coarse``, ``/registration`` to the
-        frozen template with ``confidence(shape, vertex)``; in ``/latent`` ``latent_basis(shape,
-        mode, latent)``, shape differences and ``distance_to_limit(shape)``; in ``/pca``
-        ``score(shape, component)`` on the frozen modes, these, and ``reconstruction_error(shape)``;
-        ``/report``.  ``/original`` has the template's mesh too, so that labels can be transferred.
+        A study of the new shapes: ``/original``, with the template's mesh too, ``/coarse``,
+        ``/registration`` to the template with ``confidence(shape, vertex)``; ``/latent`` with
+        ``latent_basis(shape, eigenpair, latent)``, shape differences and
+        ``distance_to_limit(shape)``; ``/pca`` with the modes of the study, ``score(shape,
+        component)`` and ``reconstruction_error(shape)``; ``/report``.
 
     Raises
     ------
     ValueError
-        When the study is not finished, no shape can be used, one has the name of the template, or
-        `reflect` names none of them.
+        If the study is not finished, no shape can be used, one has the name of the template, or
+        `reflect` names a shape that is not given.
+
+    See Also
+    --------
+    analyse : analyse a collection.
+    register_pairs : register pairs of shapes of a study.
 
     Examples
     --------
@@ -134,13 +135,13 @@ def insert(
     if template in meshes:
         raise ValueError(f"new shapes need other names than the template, {template!r}; rename it")
     descriptors = descriptors_of(study) if compare or reflect == AUTO else {}
-    mirrored, told = reflected_of_new(reflect, meshes, list(attrs), descriptors)
+    mirrored, remarks = reflected_of_new(reflect, meshes, list(attrs), descriptors)
     for name in mirrored:
         meshes[name] = mirror_image(meshes[name])
         attrs[name] = attrs[name] | meshes[name].attrs
     frozen = freeze(study, options)
     references = descriptors if compare else None
-    # in a tuple: a Dataset of its own is kept by one worker of dask, and is lost with that
+    # in a tuple: dask keeps a bare Dataset on one worker, and loses it with that worker
     results = workers(n_jobs)(
         delayed(insert_one)((mesh,), frozen, options, references) for mesh in meshes.values()
     )
@@ -151,21 +152,21 @@ def insert(
         else:
             inserted[name] = result
     if not inserted:
-        reasons = "; ".join(f"{name}: {said['reason']}" for name, said in attrs.items())
+        reasons = "; ".join(f"{name}: {values['reason']}" for name, values in attrs.items())
         raise ValueError(f"no shape can be inserted ({reasons})")
 
     nodes = {f"original/{name}": meshes[name] for name in inserted}
     nodes[f"original/{template}"] = frozen.template.original
-    nodes |= {f"coarse/{name}": one.coarse for name, one in inserted.items()}
+    nodes |= {f"coarse/{name}": result.coarse for name, result in inserted.items()}
     nodes["latent"] = out_of_sample_latent(
-        np.stack([one.Y for one in inserted.values()]),
-        np.stack([one.coarse["eigenvalue"].values for one in inserted.values()]),
+        np.stack([result.Y for result in inserted.values()]),
+        np.stack([result.coarse["eigenvalue"].values for result in inserted.values()]),
         study["latent"].dataset["latent_eigenvalue"].values,
         options.norm,
     ).assign_coords(shape=list(inserted))
     nodes |= stack_registration(
         template_mesh(frozen.template.original, template),
-        {name: one.registration for name, one in inserted.items()},
+        {name: result.registration for name, result in inserted.items()},
         list(inserted),
     )
     if "pca" in study:
@@ -174,11 +175,11 @@ def insert(
     if references is None:
         nodes["report"] = shape_report(attrs)
     else:
-        looks = {name: one.look for name, one in inserted.items() if one.look is not None}
-        nodes["report"] = report_beside(study, attrs, looks, references)
+        compared = {name: r.comparison for name, r in inserted.items() if r.comparison is not None}
+        nodes["report"] = report_on_new(study, attrs, compared, references)
     report = nodes["report"].attrs
-    report["remarks"] = "\n".join(filter(None, [*told, report["remarks"]]))
-    # all that were given are in the result
+    report["remarks"] = "\n".join(filter(None, [*remarks, report["remarks"]]))
+    # flagged shapes are in the result too
     report.update(with_options(report, {"include_flagged": True}))
     if reflect is not None:
         nodes["report"]["reflected"] = variable("reflected", [name in mirrored for name in attrs])
@@ -191,34 +192,34 @@ def reflected_of_new(
     given: list[str],
     descriptors: dict[str, xr.Dataset],
 ) -> tuple[list[str], list[str]]:
-    """The new shapes whose mirror images are taken, and what is told of the choice.
+    """Choose the new shapes to mirror; return their names, and remarks.
 
     Parameters
     ----------
     reflect : see :func:`insert`
     meshes : dict of str to Dataset
-        The new ones that can be used.
+        The usable new shapes.
     given : list of str
-        Names of all.
+        Names of all new shapes.
     descriptors : dict of str to Dataset
-        Of shapes of the study, see :func:`descriptors_of`.
+        See :func:`descriptors_of`.
     """
     if reflect is None:
         return [], []
     if reflect == AUTO:
-        known, looks = compare_chirality(meshes, descriptors)
-        said = {name: is_mirrored(name, look, known) for name, look in looks.items()}
-        told = [line for _, line in said.values() if line]
-        for line in told:
-            log.warning("%s", line)
-        return [name for name, (is_other, _) in said.items() if is_other], told
+        in_study, new = compare_chirality(meshes, descriptors)
+        decided = {name: is_mirrored(name, data, in_study) for name, data in new.items()}
+        remarks = [remark for _, remark in decided.values() if remark]
+        for remark in remarks:
+            log.warning("%s", remark)
+        return [name for name, (is_other, _) in decided.items() if is_other], remarks
     names = reflect.split(",") if isinstance(reflect, str) else reflect
     names = [str(name).strip() for name in names]
     unknown = [repr(name) for name in names if name not in given]
     if unknown:
         raise ValueError(
-            f"reflect names {listed(unknown)}, none of the new shapes ({listed(given)}); "
-            "'auto' mirrors those of the other hand than the study's"
+            f"reflect={reflect!r}: {listed(unknown)} is not a new shape ({listed(given)}); "
+            "'auto' mirrors new shapes of the other side than the study"
         )
     return [name for name in names if name in meshes], []
 
@@ -226,17 +227,17 @@ def reflected_of_new(
 def compare_chirality(
     meshes: dict[str, xr.Dataset], descriptors: dict[str, xr.Dataset]
 ) -> tuple[dict[str, xr.Dataset], dict[str, xr.Dataset]]:
-    """:func:`s4a.input.plausibility.compare` of shapes of the study, and of new ones."""
-    known = {
-        name: plausibility.compare(name, seen, descriptors) for name, seen in descriptors.items()
+    """Compare shapes of the study, and new ones, with the `descriptors` of the study."""
+    in_study = {
+        name: plausibility.compare(name, data, descriptors) for name, data in descriptors.items()
     }
-    looks = {
+    new = {
         name: plausibility.compare(
             "", plausibility.describe(mesh, intersections=False), descriptors
         )
         for name, mesh in meshes.items()
     }
-    return known, looks
+    return in_study, new
 
 
 def read_new(
@@ -244,11 +245,11 @@ def read_new(
     options: Options,
     landmarks: Path | str | None = None,
 ) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:
-    """The new meshes that can be used, with what guides them, and attributes for the report."""
+    """Read the usable new meshes, with landmarks and fields, and attributes for the report."""
     volumes = options.label is not None and (isinstance(shapes, dict) or not are_meshes(shapes))
     sources = find_sources(shapes, volumes=volumes)
     cleaning = options.of("cleaning")
-    if options.label is not None and not volumes:  # meshes beside a study of label volumes
+    if options.label is not None and not volumes:  # meshes for a study of label volumes
         cleaning = cleaning | {"label": None}
     files = {} if landmarks is None else files_named(landmarks, sources, "landmarks", SUFFIXES)
     meshes: dict[str, xr.Dataset] = {}
@@ -265,16 +266,13 @@ def read_new(
 
 
 def are_meshes(paths: Path | str | list[Any]) -> bool:
-    """Whether all of these are files that are named as meshes."""
+    """Return whether all paths are files with the suffix of a mesh format."""
     files = [paths] if isinstance(paths, str | Path) else paths
     return all(Path(file).is_file() and suffix_of(file) in MESHES for file in files)
 
 
 def freeze(study: xr.DataTree, options: Options) -> Frozen:
-    """What new shapes need of a study, the template first.
-
-    Shapes that failed, and those that the study leaves out as flagged, are not among them.
-    """
+    """Collect template and network of a study, without failed and excluded shapes."""
     latent = study["latent"].to_dataset()
     require(latent, "latent_basis", "latent_eigenvalue", what="latent dataset")
     rotation = study["registration"].dataset["rotation"]
@@ -297,10 +295,7 @@ def insert_one(
     options: Options,
     references: dict[str, xr.Dataset] | None,
 ) -> Inserted | ValueError:
-    """One new shape: coarse mesh, latent basis, registration, plausibility; or why there is none.
-
-    An error is given back and not raised, as it costs this shape alone.
-    """
+    """Insert one new shape; a ValueError is returned, as it concerns this shape only."""
     try:
         with threadpool_limits(1):
             return _insert_one(*meshes, frozen, options, references)
@@ -315,86 +310,84 @@ def _insert_one(mesh, frozen, options, references):
     coarse = low_resolution(mesh, **options.of("low resolution") | {"k": k})
     if coarse.sizes["eigenpair"] < k:
         raise ValueError(
-            f"the study needs {k} eigenfunctions, this shape has only {coarse.sizes['eigenpair']}"
+            f"{k} eigenfunctions needed, as in the study; this shape has only "
+            f"{coarse.sizes['eigenpair']}: give a finer mesh"
         )
     shape = Shape(mesh, coarse, **options.of("projection"))
     R, t = transform_onto(shape.low, template.low)
-    turn = study["registration"]["rotation"]  # onto the template
+    rotation = study["registration"]["rotation"]  # onto the template
     Y = out_of_sample_basis_in(
         study,
         names,
         Shape(coarse=coarse).low,
-        lambda name: (turn.sel(shape=name).values.T @ R, np.zeros(3)),
+        lambda name: (rotation.sel(shape=name).values.T @ R, np.zeros(3)),
         k_init=min(options.k_init, k),
         step=options.step,
         **options.of("initial maps"),
     )
     settings = {"dense_match": options.dense_match, **options.of("registration")}
     registration = from_latent(shape, template, (Y, of_template), (R, t), **settings)
-    seen = None
+    comparison = None
     if references is not None:
         descriptor = plausibility.describe(mesh, intersections=can_count(options.intersections))
-        seen = plausibility.compare("", descriptor, references)
-    return Inserted(coarse, Y, registration, seen)
+        comparison = plausibility.compare("", descriptor, references)
+    return Inserted(coarse, Y, registration, comparison)
 
 
-def known_to(study: xr.DataTree) -> dict[str, dict[Any, Any]]:
-    """Attributes of the registered shapes of a study that are in its modes."""
-    doubted = left_out(study)
+def attributes_of(study: xr.DataTree) -> dict[str, dict[Any, Any]]:
+    """Return the attributes of the shapes of a study that are not excluded."""
+    excluded = left_out(study)
     names = study["registration"].dataset["shape"].values.tolist()
-    return {name: study["original"][name].attrs for name in names if name not in doubted}
+    return {name: study["original"][name].attrs for name in names if name not in excluded}
 
 
 def descriptors_of(study: xr.DataTree) -> dict[str, xr.Dataset]:
-    """Portraits of the shapes of a study beside which new ones are seen."""
+    """Return the descriptors of the references of a study."""
     descriptors = {}
-    known = known_to(study)
-    by_size = sorted(known, key=lambda name: known[name]["area"])
-    for name in plausibility.spread(by_size, 2 * plausibility.N_REFERENCES):
+    attrs = attributes_of(study)
+    by_size = sorted(attrs, key=lambda name: attrs[name]["area"])
+    for name in plausibility.evenly_chosen(by_size, 2 * plausibility.N_REFERENCES):
         mesh = study["original"][name].to_dataset()
-        seen = plausibility.describe(mesh, intersections=False)
-        if "report" in study:  # where they were counted
+        descriptor = plausibility.describe(mesh, intersections=False)
+        if "report" in study:  # they were counted before
             number = int(study["report"]["self_intersections"].sel(shape=name))
             share = number / mesh.sizes["triangle"] if number >= 0 else -1.0
-            seen = seen.assign_attrs(self_intersections=number, intersecting=share)
-        descriptors[name] = seen
+            descriptor = descriptor.assign_attrs(self_intersections=number, intersecting=share)
+        descriptors[name] = descriptor
     return {name: descriptors[name] for name in plausibility.pick_references(descriptors)}
 
 
-def report_beside(
+def report_on_new(
     study: xr.DataTree,
     attrs: dict[str, Any],
-    looks: dict[str, xr.Dataset],
+    comparisons: dict[str, xr.Dataset],
     references: dict[str, xr.Dataset],
 ) -> xr.Dataset:
-    """The report on the new shapes, each beside those of the study."""
-    known = known_to(study)
-    known_looks = {
-        name: plausibility.compare(name, seen, references) for name, seen in references.items()
-    }
-    reported_before = find_warnings(known, known_looks)[1]
+    """Make the report on the new shapes, each compared with those of the study."""
+    in_study = attributes_of(study)
+    compared = {name: plausibility.compare(name, d, references) for name, d in references.items()}
+    reported_before = find_warnings(in_study, compared)[1]
     reports, remarks = [], {}
-    for name, said in attrs.items():
-        if name not in looks:  # it could not be used
-            reports.append(shape_report({name: said}))
+    for name, values in attrs.items():
+        if name not in comparisons:  # the shape is excluded
+            reports.append(shape_report({name: values}))
             continue
-        flags, told = find_warnings(known | {name: said}, known_looks | {name: looks[name]})
-        reports.append(shape_report({name: said}, flags, evidence={name: looks[name]}))
-        remarks |= dict.fromkeys(line for line in told if line not in reported_before)
+        new = {name: comparisons[name]}
+        flags, lines = find_warnings(in_study | {name: values}, compared | new)
+        reports.append(shape_report({name: values}, flags, comparisons=new))
+        remarks |= dict.fromkeys(line for line in lines if line not in reported_before)
     return xr.concat(reports, dim="shape").assign_attrs(remarks="\n".join(remarks))
 
 
 def scores_of_new(modes: xr.Dataset, registration: xr.Dataset, area: np.ndarray) -> xr.Dataset:
-    """The frozen modes, with the scores of the new shapes in place of those that made them."""
-    score, left = project_scores(
+    """Replace the scores of ``/pca`` by those of new shapes, on the same modes."""
+    score, error = project_scores(
         registration["displacement"].values,
         modes["mean_displacement"].values,
         modes["deformation"].values,
         modes["standard_deviation"].values,
         area,
     )
-    new = in_unit(dataset(score=score, reconstruction_error=left), unit_of(modes["deformation"]))
-    frozen = modes.drop_vars(
-        ["score", "shape", "score_excluded", "shape_excluded"], errors="ignore"
-    )
-    return frozen.merge(new).assign_coords(shape=registration["shape"])
+    new = in_unit(dataset(score=score, reconstruction_error=error), unit_of(modes["deformation"]))
+    rest = modes.drop_vars(["score", "shape", "score_excluded", "shape_excluded"], errors="ignore")
+    return rest.merge(new).assign_coords(shape=registration["shape"])

@@ -1,13 +1,13 @@
-"""One file of a study (4): netCDF-4, which any program reads, with one writer and one fast reader.
+"""Write and read the files of a study (4): netCDF-4 with checksums and a fast table of contents.
 
-HDF5 takes milliseconds to tell what a file holds, and a study of a thousand shapes has three
-thousand files.  Each file therefore has its own contents as text in the variable
-``/s4a/contents_3``: JSON with the attributes, dims and types of every group, and the values of
-texts and small variables.  The contents and all variables of numbers have Fletcher-32 checksums,
-which HDF5 verifies whenever it reads them; its notes of them have checksums since version 1.10.
+HDF5 takes milliseconds to list a file, and a study of a thousand shapes has three thousand files.
+Each file therefore has its contents in the variable ``/s4a/contents_3``: JSON with the attributes,
+dims and types of every group, and the values of texts and small variables.  The contents and all
+numeric variables have Fletcher-32 checksums, which HDF5 verifies whenever it reads them; its
+metadata has checksums since version 1.10.
 
-A study may be of a stranger.  HDF5 follows links into other files, takes values from them (external
-storage, virtual datasets) and unpacks what was stored small.  :func:`open_hdf5` and
+A study may be untrusted.  HDF5 follows links into other files, reads values from them (external
+storage, virtual datasets) and unpacks compressed data of any size.  :func:`open_hdf5` and
 :func:`values_of` refuse all of this.
 """
 
@@ -32,15 +32,15 @@ from xarray.core import indexing
 from s4a.schema import check_indices
 
 GROUP, CONTENTS = "s4a", "s4a/contents_3"  # with the number of the format
-SMALL = 100  # numbers up to which the contents have the values of a variable
-COMPRESSED = 1000  # numbers from which a variable is compressed where that is asked for
-LARGEST_TEXT = 2**31  # bytes of memory that the texts of a variable may need
+SMALL = 100  # largest variable whose values are in the contents
+COMPRESSED = 1000  # smallest variable that is compressed on request
+LARGEST_TEXT = 2**31  # bytes of memory for the texts of a variable
 FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
-NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable."  # as netCDF notes it
+NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable."  # text of netCDF
 
 
 class DamagedError(OSError):
-    """A file of a study that is not, or no longer, what a run wrote."""
+    """A file of a study is damaged or was changed."""
 
 
 # ---- reading any HDF5
@@ -48,20 +48,20 @@ class DamagedError(OSError):
 
 @contextmanager
 def damage_named(path: Path | str) -> Iterator[None]:
-    """Turn every error that damage in a file causes into a DamagedError with file and remedy."""
+    """Turn any error that damage in a file causes into a DamagedError with file and remedy."""
     try:
         yield
     except (FileNotFoundError, PermissionError, MemoryError, DamagedError):
         raise
-    except Exception as error:  # HDF5, h5py and NumPy each have their own ways with damage
+    except Exception as error:  # HDF5, h5py and NumPy raise many types
         raise DamagedError(
             f"{path} cannot be read ({error}): remove it and run the analysis again, "
-            "which makes it again and nothing else"
+            "which computes only the missing file"
         ) from error
 
 
 def check_regular(path: Path | str) -> None:
-    """OSError for a link, a pipe, a device or a folder in the place of a file of a study."""
+    """Raise OSError unless a file of a study is a regular file, not a link, pipe or device."""
     kind = os.lstat(path).st_mode
     if stat.S_ISLNK(kind):
         raise OSError("a symbolic link, which is not followed within a study")
@@ -71,7 +71,7 @@ def check_regular(path: Path | str) -> None:
 
 @contextmanager
 def open_hdf5(path: Path | str) -> Iterator[h5f.FileID]:
-    """Open an HDF5 file of whatever origin: neither a link nor a pipe, a device or a folder."""
+    """Open an untrusted HDF5 file; links, pipes, devices and folders are refused."""
     with damage_named(path):
         check_regular(path)
         file = h5f.open(os.fsencode(path), h5f.ACC_RDONLY)
@@ -82,26 +82,26 @@ def open_hdf5(path: Path | str) -> Iterator[h5f.FileID]:
 
 
 def values_of(file: h5f.FileID, name: str) -> np.ndarray:
-    """Read the numbers of a variable; OSError unless they are bytes of the file itself."""
-    place: Any = file
+    """Read the numbers of a variable; OSError unless they are stored in the file itself."""
+    stored: Any = file
     for part in name.encode().split(b"/"):
-        if place.links.get_info(part).type != h5l.TYPE_HARD:
+        if stored.links.get_info(part).type != h5l.TYPE_HARD:
             raise OSError(f"{name} is a link, and links are not followed")
-        place = h5o.open(place, part)
-    if not isinstance(place, h5d.DatasetID):
+        stored = h5o.open(stored, part)
+    if not isinstance(stored, h5d.DatasetID):
         raise OSError(f"{name} is not a variable")
-    plan = place.get_create_plist()
+    plan = stored.get_create_plist()
     if plan.get_layout() == h5d.VIRTUAL or plan.get_external_count():
-        raise OSError(f"{name} takes its values from other files, which are not read")
+        raise OSError(f"{name} has its values in other files, which are not read")
     if not {plan.get_filter(i)[0] for i in range(plan.get_nfilters())} <= FILTERS:
-        raise OSError(f"{name} is packed in another way than variables of a study are")
-    if place.dtype.kind not in "iuf":
-        raise OSError(f"{name} needs numbers, found {place.dtype}")
-    # Deflate packs at most 1032 to 1: more is refused before memory is asked for
-    if math.prod(place.shape) * place.dtype.itemsize > 1032 * place.get_storage_size():
-        raise OSError(f"{name} has not all values that it should have")
-    values = np.empty(place.shape, place.dtype)
-    place.read(h5s.ALL, h5s.ALL, values)
+        raise OSError(f"{name} has a filter that files of a study do not use")
+    if stored.dtype.kind not in "iuf":
+        raise OSError(f"{name} needs numbers, found {stored.dtype}")
+    # Deflate packs at most 1032 to 1: check before memory is allocated
+    if math.prod(stored.shape) * stored.dtype.itemsize > 1032 * stored.get_storage_size():
+        raise OSError(f"{name} is incomplete")
+    values = np.empty(stored.shape, stored.dtype)
+    stored.read(h5s.ALL, h5s.ALL, values)
     return values
 
 
@@ -110,10 +110,10 @@ def values_of(file: h5f.FileID, name: str) -> np.ndarray:
 
 @contextmanager
 def opened(path: Path | str) -> Iterator[tuple[h5f.FileID, bytes, dict[str, Any]]]:
-    """An open file, its contents as they stand in it, and as a dict.
+    """Open a file; yields the file, its contents as stored, and as a dict.
 
-    The dict has for each group, by its path ("" for that of the file), its attributes ``attrs``,
-    its ``variables`` and the names of its coordinates ``coords``.
+    The dict has for each group, by its path ("" for the root), its attributes ``attrs``, its
+    ``variables`` and the names of its coordinates ``coords``.
     """
     with open_hdf5(path) as file:
         if not file.links.exists(GROUP.encode()):
@@ -124,33 +124,33 @@ def opened(path: Path | str) -> Iterator[tuple[h5f.FileID, bytes, dict[str, Any]
         yield file, text, json.loads(text)
 
 
-def values_in(file: h5f.FileID, path: str, one: Mapping[str, Any]) -> np.ndarray:
-    """The values of a variable of an open file, of which `one` are the contents."""
-    dtype = type_of(one)
-    values = np.array(one["values"], object) if "values" in one else values_of(file, path)
-    if dtype.kind == "U":  # NumPy gives each text the length of the longest
+def values_in(file: h5f.FileID, path: str, entry: Mapping[str, Any]) -> np.ndarray:
+    """Read a variable of an open file, given its entry in the contents."""
+    dtype = type_of(entry)
+    values = np.array(entry["values"], object) if "values" in entry else values_of(file, path)
+    if dtype.kind == "U":  # NumPy pads each text to the longest
         if 4 * max(map(len, values.flat), default=0) * values.size > LARGEST_TEXT:
             raise OSError(f"{path} has more text than its file")
-        return values.astype(str).reshape(one["shape"])
-    return values.astype(dtype, copy=False).reshape(one["shape"])
+        return values.astype(str).reshape(entry["shape"])
+    return values.astype(dtype, copy=False).reshape(entry["shape"])
 
 
-def type_of(one: Mapping[str, Any]) -> np.dtype:
-    """The type of a variable; OSError unless it is one of numbers, truth values or texts."""
-    dtype = np.dtype(one["dtype"])
+def type_of(entry: Mapping[str, Any]) -> np.dtype:
+    """Return the type of a variable; OSError unless it is of numbers, booleans or texts."""
+    dtype = np.dtype(entry["dtype"])
     if dtype.kind not in "iufbU":
         raise OSError(f"numbers or texts needed, found {dtype}")
     return dtype
 
 
 class Stored(BackendArray):
-    """A variable of a file that is read when it is asked for; it holds no file open."""
+    """A variable that is read when it is used; the file is not kept open."""
 
     def __init__(
-        self, file: Path, path: str, one: Mapping[str, Any], stamp: bytes, sizes: dict[str, int]
+        self, file: Path, path: str, entry: Mapping[str, Any], stamp: bytes, sizes: dict[str, int]
     ):
-        self.file, self.path, self.one, self.stamp, self.sizes = file, path, one, stamp, sizes
-        self.shape, self.dtype = tuple(map(int, one["shape"])), type_of(one)
+        self.file, self.path, self.entry, self.stamp, self.sizes = file, path, entry, stamp, sizes
+        self.shape, self.dtype = tuple(map(int, entry["shape"])), type_of(entry)
         self.written = os.stat(file).st_mtime_ns
 
     def __getitem__(self, key):
@@ -159,11 +159,12 @@ class Stored(BackendArray):
         )
 
     def part(self, key: Any) -> np.ndarray:
-        """Read the selection from the file; ValueError where it was written again."""
+        """Read the selection from the file; ValueError if the file was written again."""
         with open_hdf5(self.file) as file:
-            same = os.stat(self.file).st_mtime_ns == self.written  # or by the same run again
+            same = os.stat(self.file).st_mtime_ns == self.written
+            # a repeated run may write the same contents
             if same := same or values_of(file, CONTENTS).tobytes() == self.stamp:
-                values = values_in(file, self.path, self.one)
+                values = values_in(file, self.path, self.entry)
                 check_indices(Path(self.path).name, values, self.sizes)
         if not same:
             raise ValueError(
@@ -173,15 +174,15 @@ class Stored(BackendArray):
 
 
 class Stacked(BackendArray):
-    """Variables of equal shape, one of each shape of a study; read are those that are asked for."""
+    """Stack of variables, one per shape of a study, that are read when they are used."""
 
     def __init__(self, variables: list[xr.Variable]):
         self.variables = variables
-        shapes = {one.shape for one in variables}
+        shapes = {variable.shape for variable in variables}
         if len(shapes) != 1:
-            raise ValueError(f"arrays of one shape needed, found {sorted(shapes)}")
+            raise ValueError(f"arrays of equal shape needed, found {sorted(shapes)}")
         self.shape = (len(variables), *shapes.pop())
-        self.dtype = np.result_type(*(one.dtype for one in variables))
+        self.dtype = np.result_type(*(variable.dtype for variable in variables))
 
     def __getitem__(self, key):
         return indexing.explicit_indexing_adapter(
@@ -189,20 +190,20 @@ class Stacked(BackendArray):
         )
 
     def part(self, key: tuple[Any, ...]) -> np.ndarray:
-        """The selection: of each axis an integer, a slice or an array of integers."""
-        first, *rest = key
-        rows = np.arange(len(self.variables))[first]
+        """Read a selection: an integer, a slice or an array of integers for each axis."""
+        row_key, *rest = key
+        rows = np.arange(len(self.variables))[row_key]
         if np.ndim(rows) == 0:
             return self.variables[rows][tuple(rest)].values
         like = xr.Variable(self.variables[0].dims, np.broadcast_to(0, self.shape[1:]))
-        found = np.empty((len(rows), *like[tuple(rest)].shape), self.dtype)
+        values = np.empty((len(rows), *like[tuple(rest)].shape), self.dtype)
         for i, row in enumerate(rows):
-            found[i] = self.variables[row][tuple(rest)].values
-        return found
+            values[i] = self.variables[row][tuple(rest)].values
+        return values
 
 
 def stacked(variables: list[xr.Variable]) -> Any:
-    """What a variable holds that is read from several files when it is used, and then kept."""
+    """Lazy data of a variable, stacked from several files, with a cache."""
     lazy: Any = indexing.LazilyIndexedArray(Stacked(variables))
     return indexing.MemoryCachedArray(indexing.CopyOnWriteArray(lazy))
 
@@ -214,33 +215,33 @@ def open_file(
     node: str = "",
     load: bool = False,
 ) -> xr.Dataset:
-    """The Dataset of a file, or of a group; its larger variables are read when they are used.
+    """Open a file, or a group of it, as a Dataset; larger variables are read when they are used.
 
     Parameters
     ----------
     path : path
     others : dict of str to int, optional
-        Sizes of dims of other files, into which indices of this one point.
+        Sizes of dims of other files that indices of this file refer to.
     node : str
         Path of the group.
     load : bool
-        Whether all variables are read now.
+        Read all variables now.
     """
-    path = Path(path).absolute()  # what is read later does not follow the working directory
+    path = Path(path).absolute()  # the working directory may change before a variable is read
     with opened(path) as (file, text, nodes):
         sizes = dict(others or {})
-        for one in nodes[node]["variables"].values():
-            sizes |= dict(zip(one["dims"], one["shape"], strict=True))
+        for entry in nodes[node]["variables"].values():
+            sizes |= dict(zip(entry["dims"], entry["shape"], strict=True))
         variables = {}
-        for name, one in nodes[node]["variables"].items():
-            place = f"{node}/{name}".lstrip("/")
+        for name, entry in nodes[node]["variables"].items():
+            inner = f"{node}/{name}".lstrip("/")
             values: Any
-            if load or "values" in one:
-                values = values_in(file, place, one)
+            if load or "values" in entry:
+                values = values_in(file, inner, entry)
                 check_indices(name, values, sizes)
             else:
-                values = indexing.LazilyIndexedArray(Stored(path, place, one, text, sizes))
-            variables[name] = xr.Variable(one["dims"], values, one["attrs"])
+                values = indexing.LazilyIndexedArray(Stored(path, inner, entry, text, sizes))
+            variables[name] = xr.Variable(entry["dims"], values, entry["attrs"])
         data = xr.Dataset(variables, attrs=nodes[node]["attrs"])
         data.encoding["source"] = str(path)
         coords = [name for name in nodes[node]["coords"] if name not in data.coords]
@@ -248,37 +249,37 @@ def open_file(
 
 
 def read(path: Path | str, others: Mapping[str, int] | None = None) -> xr.Dataset:
-    """The Dataset of :func:`open_file`, in memory."""
+    """Read a file as a Dataset in memory, see :func:`open_file`."""
     return open_file(path, others, load=True)
 
 
 def read_tree(path: Path | str) -> xr.DataTree:
-    """The tree of one file, in memory."""
+    """Read a file as a DataTree in memory."""
     with opened(path) as (_, _, nodes):
         names = list(nodes)
     return xr.DataTree.from_dict({f"/{n}": open_file(path, node=n, load=True) for n in names})
 
 
 def arrays(path: Path | str, *names: str) -> list[np.ndarray]:
-    """The values of some variables of one file, without a Dataset."""
+    """Read the values of some variables of a file."""
     with opened(path) as (file, _, nodes):
         return [values_in(file, name, nodes[""]["variables"][name]) for name in names]
 
 
 def attributes(path: Path | str) -> dict[str, Any]:
-    """The attributes of one file."""
+    """Read the attributes of a file."""
     with opened(path) as (_, _, nodes):
         return nodes[""]["attrs"]
 
 
 def is_done(path: Path | str, key: str) -> bool:
-    """Whether the file of a task is there, of this key, and every variable as it was written."""
+    """Return whether the file of a task exists, has this key, and is undamaged."""
     try:
         with opened(path) as (file, _, nodes):
-            for name, one in nodes[""]["variables"].items():
-                values_in(file, name, one)
+            for name, entry in nodes[""]["variables"].items():
+                values_in(file, name, entry)
             return nodes[""]["attrs"].get("task_key") == key
-    except OSError:  # absent, damaged, foreign: computed again
+    except OSError:  # missing, damaged or foreign: compute again
         return False
 
 
@@ -293,18 +294,18 @@ def write_netcdf(
     Parameters
     ----------
     data : Dataset or DataTree
-        Of numbers, truth values and texts.
+        Variables of numbers, booleans and texts.
     file : binary file
         Open for reading and writing, such as ``io.BytesIO()``.
     compression : int
-        Level of zlib, up to 9, for variables of more than 1,000 numbers; 0 compresses nothing.
+        Level of zlib, up to 9, for variables of more than 1,000 numbers; 0 for none.
 
     Raises
     ------
     TypeError
-        When a variable or an attribute is neither a number, nor a text, nor an array of them.
+        If a variable or an attribute is not a number, a text, or an array of them.
     ValueError
-        When a name has a slash, or a variable the name of a dim and others than that alone.
+        If a name has a slash, or a variable has the name of a dim and other dims.
 
     Examples
     --------
@@ -320,39 +321,40 @@ def write_netcdf(
     nodes = {"": data}
     if isinstance(data, xr.DataTree):
         nodes = {n.path.strip("/"): n.to_dataset(inherit=False) for n in data.subtree}
-    # 1.10 has checksums of its own notes, and no index of 2 KB for each variable
-    with h5py.File(file, "w", libver="v110", track_order=True) as root:  # as netCDF asks
+    # 1.10 has checksums of its metadata, and no index of 2 KB for each variable
+    with h5py.File(file, "w", libver="v110", track_order=True) as root:  # netCDF needs the order
         root.attrs["_NCProperties"] = np.array(f"version=2,hdf5={h5py.version.hdf5_version}", "S")
-        for node, one in nodes.items():
-            _write_group(root.require_group(node) if node else root, one, compression)
-        said = {node: _contents_of(one) for node, one in nodes.items()}
-        text = json.dumps(said, default=lambda number: number.tolist()).encode()
+        for node, group in nodes.items():
+            _write_group(root.require_group(node) if node else root, group, compression)
+        contents = {node: _contents_of(group) for node, group in nodes.items()}
+        text = json.dumps(contents, default=lambda number: number.tolist()).encode()
         packed = {"chunks": (len(text),), "compression": 1, "fletcher32": True}
         root.create_dataset(CONTENTS, data=np.frombuffer(text, "u1"), **packed).make_scale()
 
 
 def _contents_of(data):
-    """The contents of one group, see :func:`opened`."""
+    """Contents of one group, see :func:`opened`."""
     variables = {}
-    for name, one in data.variables.items():
-        kind = "U" if one.dtype.kind in "UO" else one.dtype.str
-        variables[name] = {"dims": one.dims, "shape": one.shape, "dtype": kind, "attrs": one.attrs}
-        if kind == "U" or one.size <= SMALL:
-            variables[name]["values"] = one.values.tolist()
+    for name, var in data.variables.items():
+        kind = "U" if var.dtype.kind in "UO" else var.dtype.str
+        variables[name] = {"dims": var.dims, "shape": var.shape, "dtype": kind, "attrs": var.attrs}
+        if kind == "U" or var.size <= SMALL:
+            variables[name]["values"] = var.values.tolist()
     return {"attrs": data.attrs, "variables": variables, "coords": list(data.coords)}
 
 
 def _write_group(group, data, compression):
-    """The variables, attributes and dims of one group, as the conventions of netCDF have them."""
+    """Write variables, attributes and dims of a group by the conventions of netCDF."""
     variables, attrs = cf_encoder(*encode_dataset_coordinates(data.drop_encoding()))
     _add_attributes(group, attrs)
     stored: dict[str, h5py.Dataset] = {}
-    for name, one in variables.items():
-        if "/" in "".join((name, *one.dims)) or (name in data.sizes and one.dims != (name,)):
+    for name, var in variables.items():
+        if "/" in "".join((name, *var.dims)) or (name in data.sizes and var.dims != (name,)):
             raise ValueError(
-                f"names without slash, and of no dim but its own, needed; found {name}{one.dims}"
+                "names without slash needed, and that of a dim only for its coordinate; "
+                f"found {name}{var.dims}"
             )
-        values = _as_stored(one.values, name)
+        values = _as_stored(var.values, name)
         packed = {}
         if values.dtype.kind in "iuf" and values.size and values.ndim:  # in one chunk
             packed = {"chunks": values.shape, "fletcher32": True}
@@ -360,21 +362,21 @@ def _write_group(group, data, compression):
                 packed |= {"compression": compression, "shuffle": True}
         if data.variables[name].dtype.kind not in "iufbUO":
             raise TypeError(f"{name} needs numbers or texts, found {data.variables[name].dtype}")
-        fill = one.attrs.get("_FillValue")
+        fill = var.attrs.get("_FillValue")
         stored[name] = group.create_dataset(
             name, data=values, fillvalue=fill, track_order=True, **packed
         )
-        _add_attributes(stored[name], one.attrs)
+        _add_attributes(stored[name], var.attrs)
     for dim, size in data.sizes.items():
         scale = stored.get(dim) or group.create_dataset(dim, (size,), ">f4", track_order=True)
         scale.make_scale(dim if dim in stored else f"{NO_VARIABLE}{size:10}")
-    for name, one in variables.items():
-        for axis, dim in enumerate(one.dims if name not in data.sizes else ()):
+    for name, var in variables.items():
+        for axis, dim in enumerate(var.dims if name not in data.sizes else ()):
             stored[name].dims[axis].attach_scale(group[dim])
 
 
 def _as_stored(values, name):
-    """Values as HDF5 takes them: numbers as they are, texts of any length."""
+    """Values for HDF5: numbers as they are, texts with variable length."""
     values = np.asarray(values)
     if values.dtype.kind in "iuf":
         return values
@@ -384,7 +386,7 @@ def _as_stored(values, name):
 
 
 def _add_attributes(stored, attrs):
-    """The attributes of a variable or a group; single numbers as lists of one, as netCDF does."""
+    """Write attributes of a variable or a group; single numbers as arrays, as in netCDF."""
     for name, value in attrs.items():
         values = _as_stored(value, name)
         stored.attrs[name] = values if values.dtype.hasobject else np.atleast_1d(values)

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from joblib import effective_n_jobs, parallel_config
 
-from s4a.input.chirality import AUTO, hands, mirrored_shapes, to_reflect
+from s4a.input.chirality import AUTO, mean_chirality, mirrored_shapes, to_reflect
 from s4a.input.collection import remarks_on_files
 from s4a.input.plausibility import Flags
 from s4a.input.subjects import read_table
@@ -246,7 +246,7 @@ def choose_reflected(
         reflected, told = mirrored_shapes(looks)
         choice = dataset(
             {"told": "\n".join(told)},
-            mean_chirality=hands(looks) if looks else np.zeros(0),
+            mean_chirality=mean_chirality(looks) if looks else np.zeros(0),
             reflected=np.array([name in reflected for name in looks], int),
         )
         write(choice.assign_coords(shape=list(looks)), file, key)

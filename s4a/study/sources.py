@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
-from s4a.input.annotations import files_beside
+from s4a.input.annotations import feature_files
 from s4a.input.files import check_names, files_named, find_meshes
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import read_bytes, shown
@@ -138,7 +138,7 @@ def find_guides(
 
 def guides_of_shape(path: str, landmarks: Path | None, features: Sequence[str]) -> Guides:
     """What guides one shape: its file of landmarks, and fields beside its own file."""
-    beside = files_beside(path, features) if path and features else {}
+    beside = feature_files(path, features) if path and features else {}
     fields = {one: _keyed(file) for one, file in beside.items()}
     return Guides(_keyed(landmarks) if landmarks else None, fields)
 

@@ -1,4 +1,4 @@
-"""Panels of a study for notebooks: they show arrays, what is computed is in the step modules."""
+"""Panels that show a study in a notebook; the computations are in the modules of the steps."""
 
 from typing import Any
 
@@ -42,7 +42,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """A panel of an extension."""
+    """Return a panel that an extension registers."""
     try:
         return extensions("s4a.panels")[name]
     except KeyError:

@@ -1,6 +1,6 @@
-"""Methods side by side (5.2): one pair of shapes, and what each method carries from one to other.
+"""Methods side by side (5.2): the matches of several methods between two shapes.
 
-Colours, a checkerboard, the error where there is truth, and what a method does to areas.
+Transferred colours, a checkerboard, the error if there is ground truth, and changes of area.
 """
 
 from typing import Any
@@ -16,79 +16,85 @@ from s4a.show.draw import OKABE_ITO, SIGNED, position_colors, ramp_colors, signe
 from s4a.show.surfaces import mesh_of
 from s4a.widgets.correspondence import inverse
 from s4a.widgets.panel import WIDE, Panel, dropdown, grid, row
-from s4a.widgets.views import extent, iteration_number
+from s4a.widgets.views import extent, round_down
 
-SHOWN = [
-    ("coordinates of the source", "place"),
+OPTIONS = [
+    ("coordinates of the source", "position"),
     ("checkerboard of the source", "checker"),
     ("change of area", "area"),
 ]
 ERROR = ("error", "error")
 TRUTH = "truth"
-FIRST = ("SCALABLE", "RE-MATCH", "registered surface")  # what is shown first, where it is there
+DEFAULT = ("SCALABLE", "RE-MATCH", "registered surface")  # shown by default if available
 COLORS = (
-    "what is seen on the target: what a method carries from the source, what it does to areas, or "
-    "how far it is from the truth"
+    "colours on the target: transferred from the source by the method, its change of area, or its "
+    "error"
 )
-METHOD = "which method's match is shown in this view"
+METHOD = "the method whose match is shown in this view"
 MOST = 7  # methods side by side
 EVENTS = "picked", "hovered"
 CELLS = 14  # of the checkerboard along the surface's extent
-FULL_ERROR = 0.98  # quantile of the errors of a method that the colours reach, in the median
-FULL_AREA = 2.0  # doublings of the area that the colours reach
+FULL_ERROR = 0.98  # quantile of a method's errors; the colours end at the median of all methods
+FULL_AREA = 2.0  # end of the colours, in doublings of the area
 MARKS = [to_rgb(OKABE_ITO[i]) for i in (5, 4, 2, 6, 0, 1, 7)]
 
 
-def with_ground_truth(found: xr.Dataset, n_source: int) -> xr.Dataset:
-    """What was found on a pair, with the truth as one more method, where it is known."""
-    if "true_position" not in found:
-        return found
-    match = found["true_match"].values
+def with_ground_truth(result: xr.Dataset, n_source: int) -> xr.Dataset:
+    """Return the matches of a pair with the ground truth, if known, as one more method."""
+    if "true_position" not in result:
+        return result
+    match = result["true_match"].values
     truth = {
         "algorithm_match": ("vertex", match),
-        "algorithm_image": (("vertex", "xyz"), found["true_position"].values),
+        "algorithm_image": (("vertex", "xyz"), result["true_position"].values),
         "algorithm_reverse": ("source_vertex", inverse(match, n_source)),
         "algorithm_error": ("vertex", np.where(match >= 0, 0.0, np.nan)),
         "algorithm_area_change": ("vertex", np.full(len(match), np.nan)),
     }
     known = xr.Dataset(truth).expand_dims(algorithm=[TRUTH])
-    return found.drop_dims("algorithm").merge(xr.concat([found[list(truth)], known], "algorithm"))
+    methods = xr.concat([result[list(truth)], known], "algorithm")
+    return result.drop_dims("algorithm").merge(methods)
 
 
 class Comparison(Panel):
-    """The target of a pair as several methods see it, beside the source.
+    """The source of a pair next to the target with the match of several methods.
 
-    A place under the pointer, or clicked, is marked in all views; C starts a cursor that the
+    A vertex under the pointer, or clicked, is marked in all views.  C starts a cursor that the
     arrow keys move over the surface.
 
     Parameters
     ----------
-    found : xarray.DataTree
-        Of :func:`s4a.compare` with ``keep=True``, or opened from the ``compare.nc`` of
+    comparison : xarray.DataTree
+        Result of :func:`s4a.compare` with ``keep=True``, or opened from the ``compare.nc`` of
         ``s4a compare --keep``.
     methods : sequence of str, optional
-        At most seven methods of it, shown first; SCALABLE, RE-MATCH and registered surface by
-        default.  "truth" is one where it is known.
+        At most seven methods of the comparison; by default SCALABLE, RE-MATCH and registered
+        surface.  "truth" is the ground truth, if it is known.
     view, up
-        From where the surfaces are seen first; see :func:`s4a.show.draw.rotation`.
+        Initial direction of view; see :func:`s4a.show.draw.rotation`.
 
     Attributes
     ----------
     vertex, source_vertex : int
-        The vertex of the target, or of the source, that was picked last; -1 for none.
+        The last picked vertex of the target, or of the source; -1 for none.
 
     Raises
     ------
     ValueError
-        When meshes and matches were not kept, or a method is none of the result's.
+        If meshes and matches were not kept, or a method is not in the comparison.
+
+    See Also
+    --------
+    s4a.compare : the methods and their errors.
+    s4a.widgets.Correspondence : correspondence of two shapes of a study.
 
     Examples
     --------
     >>> import s4a
     >>> from s4a.widgets import Comparison
     >>> ball = s4a.synthetic.ellipsoid(300)
-    >>> found = s4a.compare(ball, ball, methods=["kNN"], keep=True)
-    >>> panel = Comparison(found)
+    >>> comparison = s4a.compare(ball, ball, methods=["kNN"], keep=True)
+    >>> panel = Comparison(comparison)
     >>> [scene.title for scene in panel.scenes[1:]]
     ['kNN']
     >>> panel.close()
@@ -97,67 +103,67 @@ class Comparison(Panel):
     title = "Methods side by side"
     vertex, source_vertex = traitlets.Int(-1), traitlets.Int(-1)
 
-    def __init__(self, found: xr.DataTree, **options: Any):
-        kept = isinstance(found, xr.DataTree) and {"source", "pairs"} <= found.children.keys()
-        if not kept:
+    def __init__(self, comparison: xr.DataTree, **options: Any):
+        is_tree = isinstance(comparison, xr.DataTree)
+        if not (is_tree and {"source", "pairs"} <= comparison.children.keys()):
             raise ValueError(
                 f"the panel {self.title} needs the meshes and matches of a comparison; found a "
-                "result without them: give s4a.compare.pair or pairs keep=True, s4a compare --keep"
+                "result without them: compare again with keep=True, or with s4a compare --keep"
             )
-        super().__init__(found, **options)
+        super().__init__(comparison, **options)
 
     def build(self, methods: Any = None) -> list[ipywidgets.Widget]:
-        """Choices, the source, and the target by each method."""
+        """Return the controls, the view of the source, and a view of the target per method."""
         self.pairs = {
             name: with_ground_truth(node.to_dataset(), self.study["source"].sizes["vertex"])
             for name, node in self.study["pairs"].children.items()
         }
-        each = [one["algorithm"].values.astype(str).tolist() for one in self.pairs.values()]
-        known = [way for way in max(each, key=len) if all(way in ways for ways in each)]
-        ways = methods
+        each = [pair["algorithm"].values.astype(str).tolist() for pair in self.pairs.values()]
+        known = [name for name in max(each, key=len) if all(name in names for names in each)]
         if methods is None:
-            ways = dict.fromkeys([*(way for way in FIRST if way in known), *known])
-            ways = list(ways)[: len(FIRST)]
-        wrong = [way for way in ways if way not in known]
-        if wrong or not 0 < len(ways) <= MOST:
+            ordered = dict.fromkeys([*(name for name in DEFAULT if name in known), *known])
+            methods = list(ordered)[: len(DEFAULT)]
+        unknown = [name for name in methods if name not in known]
+        if unknown or not 0 < len(methods) <= MOST:
             raise ValueError(
-                f"methods must be 1 to {MOST} of {', '.join(known)}; found {', '.join(ways)}"
+                f"methods must be 1 to {MOST} of {', '.join(known)}; found {', '.join(methods)}"
             )
-        looks = [*SHOWN, ERROR] if TRUTH in known else SHOWN
-        self.scenes = [self.new_scene(340, clickable=True) for _ in range(1 + len(ways))]
-        self.pair = dropdown("pair", "the shapes between which methods match", list(self.pairs))
-        self.colors, self.hover = dropdown("colours", COLORS, looks, layout=WIDE), self.follow()
+        options = [*OPTIONS, ERROR] if TRUTH in known else OPTIONS
+        self.scenes = [self.new_scene(340, clickable=True) for _ in range(1 + len(methods))]
+        self.pair = dropdown("pair", "the source and target shapes", list(self.pairs))
+        self.colors, self.hover = dropdown("colours", COLORS, options, layout=WIDE), self.follow()
         self.redraw(self.draw, self.pair)
         self.redraw(self.paint, self.colors)
-        self.on_pick(self.scenes[0], lambda place: self.choose(-1, place["vertex"]), *EVENTS)
-        self.ways = []
-        for i, way in enumerate(ways):
-            self.ways.append(dropdown(f"method {i + 1}", METHOD, known, value=way, layout=WIDE))
-            setattr(self, f"way{i}", self.ways[-1])
-            self.on_change(self.ways[-1], lambda _, i=i: self.paint_method(i))
-            to = self.scenes[1 + i]
-            self.on_pick(to, lambda place: self.choose(place["vertex"], -1), *EVENTS)
-        self.live = (*(("colors", f"way{i}", "pair") for i in range(len(ways))), ("hover",))
+        self.on_pick(self.scenes[0], lambda picked: self.choose(-1, picked["vertex"]), *EVENTS)
+        self.methods = []
+        for i, name in enumerate(methods):
+            control = dropdown(f"method {i + 1}", METHOD, known, value=name, layout=WIDE)
+            self.methods.append(control)
+            setattr(self, f"method{i}", control)
+            self.on_change(control, lambda _, i=i: self.paint_method(i))
+            scene = self.scenes[1 + i]
+            self.on_pick(scene, lambda picked: self.choose(picked["vertex"], -1), *EVENTS)
+        self.live = (*(("colors", f"method{i}", "pair") for i in range(len(methods))), ("hover",))
         self.draw()
-        return [row(self.pair, self.colors, self.hover), row(*self.ways), grid(*self.scenes)]
+        return [row(self.pair, self.colors, self.hover), row(*self.methods), grid(*self.scenes)]
 
     @property
-    def found(self) -> xr.Dataset:
-        """What was found on the pair that is shown, with the target's mesh."""
+    def result(self) -> xr.Dataset:
+        """The matches of the pair that is shown, with the target's mesh."""
         return self.pairs[self.pair.value]
 
-    def of(self, name: str, way: str) -> np.ndarray:
-        """A variable of what a method found: ``way_`` match, image, reverse, error or area."""
-        return self.found[f"algorithm_{name}"].sel(algorithm=way).values
+    def values(self, name: str, method: str) -> np.ndarray:
+        """Return the variable ``algorithm_<name>`` of a method."""
+        return self.result[f"algorithm_{name}"].sel(algorithm=method).values
 
-    def error(self, way: str) -> np.ndarray | None:
-        """The error of every vertex of the target ``(n,)``; None where truth is unknown."""
-        return self.of("error", way) if "algorithm_error" in self.found else None
+    def error(self, method: str) -> np.ndarray | None:
+        """Return the error of every vertex of the target ``(n,)``; None without ground truth."""
+        return self.values("error", method) if "algorithm_error" in self.result else None
 
     def draw(self) -> None:
-        """Both surfaces of a pair, and their colours."""
+        """Draw both surfaces of the pair and their colours."""
         self.vertex = self.source_vertex = -1
-        self.surfaces = mesh_of(self.study["source"].dataset), mesh_of(self.found)
+        self.surfaces = mesh_of(self.study["source"].dataset), mesh_of(self.result)
         count = len(self.surfaces[0][0])
         self.scenes[0].show(*self.surfaces[0], title=f"the source, {count:,} vertices")
         for scene in self.scenes[1:]:
@@ -166,85 +172,87 @@ class Comparison(Panel):
         self.paint()
 
     def paint(self) -> None:
-        """The colours of all views."""
+        """Colour all views."""
         X, _ = self.surfaces[0]
-        self.cell = iteration_number(extent(X) / CELLS)
+        self.cell = round_down(extent(X) / CELLS)
         checker = self.colors.value == "checker"
         plain = self.colors.value in ("area", "error")
         colors = None if plain else position_colors(X)
         self.scenes[0].paint(colors, None, X if checker else None, self.cell)
         unit = self.study["source"].attrs.get("unit") or "unit of the input"
-        said = f"checkerboard of cubes of {self.cell:g} ({unit})" if checker else ""
-        self.scenes[0].caption = "" if plain else said or "colours are coordinates"
-        for i in range(len(self.ways)):
+        caption = f"checkerboard of cubes of {self.cell:g} ({unit})" if checker else ""
+        self.scenes[0].caption = "" if plain else caption or "coordinates as colours"
+        for i in range(len(self.methods)):
             self.paint_method(i)
 
     def paint_method(self, i: int) -> None:
-        """The target in the colours of the method that is chosen for view `i`."""
-        way, scene = self.ways[i].value, self.scenes[1 + i]
+        """Colour the target in view `i` by the method selected for it."""
+        method, scene = self.methods[i].value, self.scenes[1 + i]
         X, _ = self.surfaces[0]
-        image, error = self.of("image", way), self.error(way)
-        mean = "" if error is None or way == TRUTH else f", error {100 * np.nanmean(error):.2f} %"
-        scene.title = f"{way}{mean}"
+        image, error = self.values("image", method), self.error(method)
+        has_error = error is not None and method != TRUTH
+        scene.title = f"{method}, error {100 * np.nanmean(error):.2f} %" if has_error else method
         bar = coordinates = None
         if self.colors.value == "error":
             limit, label = self.full_error(), "error (% of √area)"
             colors = ramp_colors(error, 0, limit)
             bar = color_scale("viridis", 0, 100 * limit, label)
         elif self.colors.value == "area":
-            label = "share of the area: doublings"
-            colors = signed_colors(self.of("area", way) / np.log(2), FULL_AREA)
+            label = "change of area (log2)"
+            colors = signed_colors(self.values("area_change", method) / np.log(2), FULL_AREA)
             bar = color_scale(SIGNED, -FULL_AREA, FULL_AREA, label)
         else:
             colors = position_colors(image, among=X)
             if self.colors.value == "checker":
                 coordinates = np.nan_to_num(image)
         scene.paint(np.clip(colors, 0, 1), bar, coordinates, self.cell)
-        back, color = self.of("reverse", way), MARKS[i]
-        scene.connect(self.of("match", way), self.said(error), error, back=back, color=color)
+        match, back = self.values("match", method), self.values("reverse", method)
+        scene.connect(match, self.caption(error), error, back=back, color=MARKS[i])
         self.point()
 
-    def said(self, error: np.ndarray | None, **numbers: Any) -> str:
-        """What is said of a vertex of the target; its `numbers` are put in by the browser, too."""
+    def caption(self, error: np.ndarray | None, **numbers: Any) -> str:
+        """Return the caption of a vertex of the target; the browser also fills in `numbers`."""
         text = "target vertex {here} → source vertex {there}"
         text += "" if error is None else ", error {value} %"
         return text.format(**numbers) if numbers else text
 
     def full_error(self) -> float:
-        """The error at which colours are full, the same for all methods of the pair."""
-        error = self.found["algorithm_error"].drop_sel(algorithm=TRUTH).values
+        """Return the end of the colour scale of errors, the same for all methods of the pair."""
+        error = self.result["algorithm_error"].drop_sel(algorithm=TRUTH).values
         reached = np.nanquantile(error, FULL_ERROR, axis=1)
         return float(max(np.median(reached), 1e-6))
 
     def choose(self, vertex: int, source_vertex: int) -> None:
-        """A place of the target or of the source, where each method has it on the other."""
+        """Select a vertex of the target or of the source; -1 for none."""
         self.vertex, self.source_vertex = vertex, source_vertex
         self.point()
 
     def point(self) -> None:
-        """Mark the vertex that was picked, and where each method has it on the other surface."""
+        """Mark the picked vertex, and its match by each method on the other surface."""
         X, there = self.surfaces[0][0], self.source_vertex
         if there >= 0:
             self.scenes[0].mark(X[there])
         elif self.vertex >= 0:
-            ends = np.array([self.of("match", choice.value)[self.vertex] for choice in self.ways])
-            colors = np.array(MARKS[: len(ends)])
-            self.scenes[0].mark(X[ends[ends >= 0]], colors[ends >= 0])
+            images = np.array(
+                [self.values("match", control.value)[self.vertex] for control in self.methods]
+            )
+            colors = np.array(MARKS[: len(images)])
+            self.scenes[0].mark(X[images[images >= 0]], colors[images >= 0])
         else:
             return
-        for i, choice in enumerate(self.ways):
-            back = self.of("reverse", choice.value)
+        for i, control in enumerate(self.methods):
+            back = self.values("reverse", control.value)
             self.mark_method(i, int(back[there]) if there >= 0 else self.vertex)
 
     def mark_method(self, i: int, vertex: int) -> None:
-        """Mark a vertex of the target in one view and say where its method puts it; -1 for none."""
-        scene, way = self.scenes[1 + i], self.ways[i].value
+        """Mark a vertex of the target in view `i`, with its match as caption; -1 for no vertex."""
+        scene, method = self.scenes[1 + i], self.methods[i].value
         scene.mark(self.surfaces[1][0][[vertex]] if vertex >= 0 else [], MARKS[i])
         if vertex < 0:
-            scene.caption = "nothing is matched to this vertex"
+            scene.caption = "no vertex is matched to this one"
             return
-        there, error = self.of("match", way)[vertex], self.error(way)
+        there, error = self.values("match", method)[vertex], self.error(method)
         value = np.nan if error is None else 100 * error[vertex]
         value = "unknown" if np.isnan(value) else f"{value:.2f}"
         there = there if there >= 0 else "unknown"
-        scene.caption = self.said(error, here=vertex, there=there, value=value)
+        scene.caption = self.caption(error, here=vertex, there=there, value=value)

@@ -17,7 +17,7 @@ from s4a.widgets.functional import FunctionalMap
 from s4a.widgets.median import Median
 from s4a.widgets.modes import Modes
 from s4a.widgets.network import Network
-from s4a.widgets.panel import OfKernel, Panel, close_all, layout_of
+from s4a.widgets.panel import KernelWidget, Panel, close_all, panel_layout
 from s4a.widgets.spectrum import Spectrum
 from s4a.widgets.transfer import Transfer
 
@@ -35,44 +35,48 @@ STAGES = ("original", "coarse", "network", "latent", "registration", "pca")  # n
 
 
 def kinds_of(study: xr.DataTree) -> dict[str, type[Panel]]:
-    """Title of a tab -> its panel: those whose needs the study has, or a finished run gives it."""
+    """Return title -> panel class, if the study has, or will have, what the panel needs."""
     known = PANELS | {kind.title: kind for kind in extensions("s4a.panels").values()}
-    coming = STAGES if not study.children or set(STAGES) & set(study.children) else ()
-    found = {
+    expected = STAGES if not study.children or set(STAGES) & set(study.children) else ()
+    kinds = {
         title: kind
         for title, kind in known.items()
-        if all(has(study, need) or need.partition("/")[0] in coming for need in kind.needs)
+        if all(has(study, need) or need.partition("/")[0] in expected for need in kind.needs)
     }
-    return found or PANELS
+    return kinds or PANELS
 
 
 def running_cell() -> str | None:
-    """The id of the notebook's cell that runs; None outside of a notebook."""
+    """Return the id of the running notebook cell; None outside of a notebook."""
     kernel = getattr(get_ipython(), "kernel", None)
     return kernel.get_parent().get("metadata", {}).get("cellId") if kernel else None
 
 
-class Explore(OfKernel):
-    """Tabs over a study.
+class Explore(KernelWidget):
+    """All panels of a study as tabs.
 
     Parameters
     ----------
     study : xarray.DataTree
-        Finished or not; the tab of a stage that is not there yet says what is missing.
+        Finished or running.  The tab of a missing stage shows what is missing.
     width : float or str, optional
-        In pixels, or any width of CSS; all that the cell has by default.
+        Width in pixels or as a CSS length; by default the width of the cell.
     **options
-        Given to every panel: ``font``, ``view`` and ``up``.
+        ``font``, ``view`` and ``up`` of every panel.
 
     Attributes
     ----------
     panels : dict
-        Title of the tab -> panel, of those that were opened.
+        Title -> panel, of the tabs that were opened.
     pair : tuple of str
-        Source and target of the map that is chosen in all tabs, ("", "") for none.  *Network* and
-        *Functional map* stay as they are where the network has no such map.
+        Source and target that are selected in all tabs, ("", "") for none.  *Network* and
+        *Functional map* do not change if the network has no map between them.
     shape : str
-        The shape that is chosen in all tabs, at first the median; "" for none.
+        Shape that is selected in all tabs, initially the median; "" for none.
+
+    See Also
+    --------
+    s4a.explore : the same; it closes the tabs of an earlier run of the cell.
     """
 
     title = "Panels of a study"
@@ -81,41 +85,41 @@ class Explore(OfKernel):
 
     def __init__(self, study: xr.DataTree, *, width: float | str | None = None, **options: Any):
         self.study, self.options, self.panels = study, options, {}
-        self.reasons = {}  # title of the tab -> why it has no panel
+        self.reasons = {}  # title of a tab without panel -> reason
         self.kinds = kinds_of(study)
-        later = PARTS.message("This tab is filled by a running kernel when it is opened.")
-        boxes = [ipywidgets.VBox([ipywidgets.HTML(later)]) for _ in self.kinds]
+        waiting = PARTS.message("This tab is filled by a running kernel when it is opened.")
+        boxes = [ipywidgets.VBox([ipywidgets.HTML(waiting)]) for _ in self.kinds]
         self.tabs = ipywidgets.Tab(children=boxes, titles=list(self.kinds))
         self.tabs.add_class("s4a-tabs")  # in style.css
-        super().__init__([self.tabs], layout=layout_of(width))
+        super().__init__([self.tabs], layout=panel_layout(width))
         self.shape = attribute(study, "latent", "median")
         self.tabs.observe(self.fill, "selected_index")
-        self.observe(lambda _: self.give(), ["pair", "shape"])
+        self.observe(lambda _: self.apply_selection(), ["pair", "shape"])
         self.fill()
-        self.cell = None  # at whose next run they close
+        self.cell = None  # the tabs close when this cell runs again
 
     @property
-    def page(self) -> str:
-        """What writes a page of the first tab."""
+    def page_command(self) -> str:
+        """The expression that writes a page of the first tab."""
         title = next(iter(self.kinds))
         return f'panels["{title}"].save_html("{title.lower()}.html")'
 
     def close_with(self, cell: str) -> None:
-        """Close when the cell of the notebook is run again, so that nothing piles up."""
+        """Close when the notebook cell runs again."""
         self.cell = cell
         get_ipython().events.register("pre_run_cell", self.before_run)
 
     def before_run(self, run: ExecutionInfo) -> None:
-        """Close if `run`, what IPython is about to do, is of the cell that made these tabs."""
+        """Close if `run`, the next execution of IPython, is of the cell that made these tabs."""
         if run.cell_id == self.cell:
             self.close()
 
     def fill(self, change: object = None) -> None:
-        """Build the panel of the selected tab, or say why there is none; it shows the selection."""
+        """Build the panel of the selected tab and apply the selection, or show the error."""
         title = list(self.kinds)[self.tabs.selected_index or 0]
         box = self.tabs.children[self.tabs.selected_index or 0]
         if title in self.panels:
-            self.give()
+            self.apply_selection()
             return
         for child in box.children:
             close_all(child)
@@ -124,9 +128,9 @@ class Explore(OfKernel):
             box.children = [panel]
             self.reasons.pop(title, None)
             if panel.shares:
-                panel.observe(lambda _: self.take(panel), panel.shares)
-            self.give()
-        except Exception as error:  # whatever it is, the tab must show it
+                panel.observe(lambda _: self.take_selection(panel), panel.shares)
+            self.apply_selection()
+        except Exception as error:  # the tab must show any error
             reason = str(error)
             if not isinstance(error, ValueError):
                 log.exception("%s", title)
@@ -134,17 +138,17 @@ class Explore(OfKernel):
             self.reasons[title] = reason
             box.children = [ipywidgets.HTML(PARTS.message(reason))]
 
-    def take(self, panel: Panel) -> None:
-        """Choose for all tabs what is chosen in a panel."""
-        if panel.recording:  # its values are gone through, and nothing is chosen
+    def take_selection(self, panel: Panel) -> None:
+        """Set the selection of all tabs to that of a panel."""
+        if panel.recording:  # the values change for a saved page only
             return
-        found = panel.selection()
-        with self.hold_trait_notifications():  # sent together: a panel shows a pair or a shape
-            self.pair = found.get("pair", self.pair)
-            self.shape = found.get("shape") or self.shape
+        selected = panel.selection()
+        with self.hold_trait_notifications():  # one notification: a panel shows a pair or a shape
+            self.pair = selected.get("pair", self.pair)
+            self.shape = selected.get("shape") or self.shape
 
-    def give(self) -> None:
-        """Show the selection in the tab that is seen; the others get it when they are."""
+    def apply_selection(self) -> None:
+        """Show the selection in the visible tab; the others show it when they are opened."""
         panel = self.panels.get(list(self.kinds)[self.tabs.selected_index or 0])
         if panel is not None:
             panel.guarded(panel.adopt)(self.pair, self.shape)
@@ -157,14 +161,14 @@ class Explore(OfKernel):
         self.extend(study)
 
     def extend(self, study: xr.DataTree) -> None:
-        """Show what a newer state of the study has more; panels that are open stay as they are."""
+        """Use a newer state of the study for tabs without panel; open panels do not change."""
         self.study = study
         self.shape = self.shape or attribute(study, "latent", "median")
         self.reasons.clear()
         self.fill()
 
     def __getitem__(self, title: str) -> ipywidgets.Widget:
-        """The panel of a tab, which is opened for it."""
+        """Open a tab and return its panel."""
         if title not in self.kinds:
             raise ValueError(f"there is no tab {title!r}; there are {', '.join(self.kinds)}")
         self.tabs.selected_index = list(self.kinds).index(title)
@@ -189,7 +193,7 @@ class Explore(OfKernel):
 
 
 def explore(study: xr.DataTree, **options: Any) -> Explore:
-    """Tabs over a study that close when the cell of the notebook that made them is run again."""
+    """Return tabs over a study that close when the notebook cell that made them runs again."""
     tabs = Explore(study, **options)
     cell = running_cell()
     if cell:

@@ -8,7 +8,7 @@ from s4a.method.fmap import off_diagonal_mass, orthogonality_error, swapped_bloc
 from s4a.method.shape import Shape
 from s4a.show.browser import PARTS
 from s4a.show.surfaces import low_text, surface
-from s4a.widgets.panel import WIDE, Panel, beside, check, dropdown, int_slider, row
+from s4a.widgets.panel import WIDE, Panel, checkbox, columns, dropdown, int_slider, row
 from s4a.widgets.views import DIRECTION, Chart, signed_limit
 
 STEP = 5
@@ -16,15 +16,15 @@ KINDS = [
     ("consistent ZoomOut, as in the study", "study"),
     ("ZoomOut of this pair alone", "zoomout"),
 ]
-WHICH = "made consistent with the maps among all shapes, or by ZoomOut of this pair alone"
-ROW = "row of the matrix: the eigenfunction of the target that is shown"
-COLUMN = "column of the matrix: the eigenfunction of the source that is shown"
-SIZE = "how many eigenfunctions the map links: ZoomOut adds them step by step"
-MOST = 3  # exchanged runs of eigenfunctions that are named in words
+WHICH = "Consistent ZoomOut of the whole network, or ZoomOut of this pair alone"
+ROW = "row of the matrix: the displayed eigenfunction of the target"
+COLUMN = "column of the matrix: the displayed eigenfunction of the source"
+SIZE = "number of eigenfunctions in the map: ZoomOut adds them step by step"
+MOST = 3  # swapped blocks that are listed
 
 
 class FunctionalMap(Panel):
-    """C of a pair; a cell that is clicked shows the two eigenfunctions that it links.
+    """Functional map C of a pair; a click on an entry shows its two eigenfunctions.
 
     Attributes
     ----------
@@ -32,6 +32,14 @@ class FunctionalMap(Panel):
         Row of ``/network``.
     cell : tuple (row, column)
         Eigenfunction of the target and eigenfunction of the source.
+
+    See Also
+    --------
+    s4a.widgets.Network : all maps of the study.
+
+    References
+    ----------
+    Ovsjanikov et al., "Functional maps", ACM Trans. Graph. 31(4), 2012.
     """
 
     needs = ("network/fmap", "network/fmap_initial")
@@ -44,20 +52,20 @@ class FunctionalMap(Panel):
     clicks = (("matrix", "row", "row"), ("matrix", "column", "column"))
 
     def build(self, pair: int = 0) -> list[ipywidgets.Widget]:
-        """Choices, matrix and the two surfaces."""
+        """Return the controls, the matrix and the views of the two surfaces."""
         network = self.study["network"].dataset
         self.source, self.target = (network[key].values.astype(str) for key in ("source", "target"))
         first, last = network.sizes["eigenpair_source_initial"], network.sizes["eigenpair_source"]
         ends = zip(self.source, self.target, strict=True)
         options = [(f"{source} → {target}", i) for i, (source, target) in enumerate(ends)]
-        self.choice = dropdown("pair", "the shape from which the map goes, and to which", options)
+        self.choice = dropdown("pair", "source and target of the map", options)
         self.kind = dropdown("map", WHICH, KINDS, layout={"width": "29em"})
         sizes = sorted({*range(first, last, STEP), last})
         slider = {"continuous_update": False, "layout": WIDE, "tooltip": SIZE}
         self.k = ipywidgets.SelectionSlider(
             options=sizes, value=last, description="size k", **slider
         )
-        self.block = check("first ten only", "the upper left corner of the matrix, magnified")
+        self.block = checkbox("first ten only", "show the first 10 × 10 entries of the matrix")
         narrow = {"layout": {"width": "23em"}}
         self.row = int_slider("target ψ", ROW, 1, 0, last - 1, **narrow)
         self.column = int_slider("source φ", COLUMN, 1, 0, last - 1, **narrow)
@@ -68,36 +76,36 @@ class FunctionalMap(Panel):
         self.redraw(self.draw, self.k, self.kind, self.block)
         self.on_pick(self.matrix, self.pick)
         self.redraw(lambda: self.pick({}), self.row, self.column)
-        self.on_change(self, self.take, "pair")
+        self.on_change(self, self.show_pair, "pair")
         self.on_change(self, self.show_cell, "cell")
         self.pair = pair
-        self.take(pair)
+        self.show_pair(pair)
         return [
             row(self.choice, self.kind, self.k, self.block),
             row(self.column, self.row),
             self.numbers,
-            beside(self.matrix, *self.scenes, least="20em"),
+            columns(self.matrix, *self.scenes, min_width="20em"),
         ]
 
     def selection(self) -> dict:
-        """The pair whose map is shown."""
+        """Return the pair whose map is shown."""
         return {"pair": self.names()}
 
     def adopt(self, pair: tuple[str, str], shape: str) -> None:
-        """Show the map of a pair that has one."""
-        for found in np.flatnonzero((self.source == pair[0]) & (self.target == pair[1])):
-            self.pair = int(found)
+        """Show the map of the pair, if it has one."""
+        for row_of_pair in np.flatnonzero((self.source == pair[0]) & (self.target == pair[1])):
+            self.pair = int(row_of_pair)
 
     def names(self) -> tuple[str, str]:
-        """Source and target of the pair."""
+        """Return source and target of the pair."""
         return str(self.source[self.pair]), str(self.target[self.pair])
 
     def pick(self, mark: dict) -> None:
-        """A cell that was clicked, or that the sliders name."""
+        """Select the clicked entry, or that of the sliders."""
         self.cell = mark.get("row", self.row.value), mark.get("column", self.column.value)
 
-    def take(self, pair: int) -> None:
-        """The two meshes of a pair and its initial map."""
+    def show_pair(self, pair: int) -> None:
+        """Show the two meshes of a pair and its map."""
         self.meshes = [self.study["coarse"][name].to_dataset() for name in self.names()]
         self.maps = {}
         self.draw()
@@ -108,13 +116,13 @@ class FunctionalMap(Panel):
         self.show_cell(self.cell)
 
     def map_of(self, k: int) -> np.ndarray:
-        """C ``(k, k)``: cut out of the study's map, or by ZoomOut from the pair's initial map."""
+        """Return C ``(k, k)``: a block of the study's map, or ZoomOut from the initial map."""
         network = self.study["network"].dataset.isel(pair=self.pair)
         if self.kind.value == "study":
             return network["fmap"].values[:k, :k]
-        first = network["fmap_initial"].values
-        size = max((done for done in self.maps if done <= k), default=len(first))
-        C = self.maps.get(size, first)
+        initial = network["fmap_initial"].values
+        size = max((known for known in self.maps if known <= k), default=len(initial))
+        C = self.maps.get(size, initial)
         source, target = (Shape(coarse=mesh).low for mesh in self.meshes)
         while size < k:
             size = min(size + STEP, k)
@@ -123,7 +131,7 @@ class FunctionalMap(Panel):
         return C
 
     def draw(self) -> None:
-        """The matrix, its numbers, and frames around runs of eigenfunctions that are exchanged."""
+        """Draw the matrix, its numbers, and frames around swapped blocks of eigenfunctions."""
         k = self.k.value
         self.C = C = self.map_of(k)
         blocks = swapped_blocks(C)
@@ -142,24 +150,24 @@ class FunctionalMap(Panel):
         swapped = "No swapped blocks."
         if runs:
             runs = ", ".join(runs[:MOST])
-            swapped = f"Exchanged among each other, framed: eigenfunctions {runs}{more}."
+            swapped = f"Swapped blocks (framed): eigenfunctions {runs}{more}."
         self.numbers.value = PARTS.paragraph(
-            f"off the diagonal {off_diagonal_mass(C):.1%} of the squared entries; "
+            f"{off_diagonal_mass(C):.1%} of the sum of squares is off the diagonal; "
             f"|CᵀC − I| / √k = {orthogonality_error(C):.3f}. {swapped}"
         )
 
     def show_cell(self, cell: tuple[int, int]) -> None:
-        """The two eigenfunctions that a cell links, on one colour scale."""
+        """Show the two eigenfunctions of an entry on one colour scale."""
         self.row.value, self.column.value = cell
         self.matrix.spec = self.matrix.spec | {"row": cell[0], "column": cell[1]}
-        modes = (("source φ", cell[1]), ("target ψ", cell[0]))
+        ends = (("source φ", cell[1]), ("target ψ", cell[0]))
         shapes = zip(self.scenes, self.meshes, self.names(), strict=True)
-        each = [
-            mesh["eigenfunction"].values[:, mode]
-            for mesh, (_, mode) in zip(self.meshes, modes, strict=True)
+        functions = [
+            mesh["eigenfunction"].values[:, i]
+            for mesh, (_, i) in zip(self.meshes, ends, strict=True)
         ]
-        limit = max(map(signed_limit, each))
-        for (role, mode), (scene, mesh, name), values in zip(modes, shapes, each, strict=True):
-            eigenvalue = mesh["eigenvalue"].values[mode]
-            scene.title = f"{role}{mode} on {name}, eigenvalue {eigenvalue:.2f}"
+        limit = max(map(signed_limit, functions))
+        for (role, i), (scene, mesh, name), values in zip(ends, shapes, functions, strict=True):
+            eigenvalue = mesh["eigenvalue"].values[i]
+            scene.title = f"{role}{i} on {name}, eigenvalue {eigenvalue:.2f}"
             scene.paint_function(values, "eigenfunction", limit)

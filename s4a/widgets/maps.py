@@ -14,14 +14,14 @@ from s4a.show.draw import SIGNED, ramp_colors, signed_colors
 from s4a.show.surfaces import has
 from s4a.widgets.panel import WIDE, Panel, dropdown, row
 
-# variable -> what it is called; those of vectors are shown along the normals
+# variable -> its name; of vectors the normal component is shown
 SIGNED_MAPS = {
     "effect": "effect, along the normals",
     "field_effect": "effect on the field",
 }
 POSITIVE_MAPS = {
     "effect_size": "effect size",
-    "explained_share": "explained share",
+    "explained_share": "explained share of the variance",
 }
 EVERYWHERE = "everywhere"
 P_VALUES = {
@@ -30,35 +30,39 @@ P_VALUES = {
     "p_vertex": "each vertex alone",
 }
 LEVELS = [0.05, 0.01, 0.001]
-MAP = "what the colours are; arrows of an effect count as far as they point outwards"
-WHERE = "grey where the p value is larger than the level, by which correction for all vertices"
-LEVEL = "the p value from which on it is grey"
+MAP = "the quantity shown as colours; of vectors the component along the outward normals"
+WHERE = "correction for multiple comparisons; vertices with p above the level are grey"
+LEVEL = "significance level"
 GREY = (0.82, 0.82, 0.82)
-FULL = 0.99  # quantile of the values that the colours reach
+FULL = 0.99  # quantile of the values at which the colour scale ends
 
 
 class Maps(Panel):
-    """What a test found at every vertex, grey where it is not significant.
+    """Result of a test at every vertex, grey where it is not significant.
 
-    A click tells the values there.
+    A click shows the values at a vertex.
 
     Parameters
     ----------
     study : xarray.DataTree
-        That was tested.
-    found : xarray.Dataset
-        Of :func:`s4a.statistics.group_map` or :func:`s4a.statistics.regression`.
+        The study that was tested.
+    result : xarray.Dataset
+        Result of :func:`s4a.statistics.group_map` or :func:`s4a.statistics.regression`.
     view, up
-        From where the surface is seen first; see :func:`s4a.show.draw.rotation`.
+        Initial direction of view; see :func:`s4a.show.draw.rotation`.
 
     Raises
     ------
     ValueError
-        When the result has no map, or is of another template.
+        If the result has no values at the vertices, or belongs to another template.
+
+    See Also
+    --------
+    s4a.statistics : the tests.
 
     Examples
     --------
-    With the ``study`` of six small brains:
+    With a study of six small brains:
 
     >>> import s4a
     >>> from s4a.widgets import Maps
@@ -75,24 +79,24 @@ class Maps(Panel):
     vertex = traitlets.Int(-1)
     live = (("map", "where", "level"),)
 
-    def __init__(self, study: xr.DataTree, found: xr.Dataset, **options: Any):
-        self.found, maps = found, self.signed | self.positive
-        self.known = [(words, name) for name, words in maps.items() if name in found]
+    def __init__(self, study: xr.DataTree, result: xr.Dataset, **options: Any):
+        self.result, maps = result, self.signed | self.positive
+        self.known = [(text, name) for name, text in maps.items() if name in result]
         ready = all(has(study, name) for name in self.needs)
         n = study["registration"].sizes["vertex"] if ready else None
-        if ready and (not self.known or found.sizes.get("vertex") != n):
+        if ready and (not self.known or result.sizes.get("vertex") != n):
             raise ValueError(
                 f"the panel {self.title} needs the maps of a test at the {n} vertices of the "
-                f"template; found {', '.join(map(str, found.data_vars)) or 'nothing'} at "
-                f"{found.sizes.get('vertex', 'no')}: give what a test such as "
-                "statistics.group_map found on this study"
+                f"template; found {', '.join(map(str, result.data_vars)) or 'nothing'} at "
+                f"{result.sizes.get('vertex', 'no')} vertices: give the result of a test such as "
+                "s4a.statistics.group_map on this study"
             )
         super().__init__(study, **options)
 
     def build(self) -> list[ipywidgets.Widget]:
-        """Choices and the surface."""
-        found, template = self.found, self.study["registration"].dataset
-        tests = [(words, name) for name, words in P_VALUES.items() if name in found]
+        """Return the controls and the view of the surface."""
+        result, template = self.result, self.study["registration"].dataset
+        tests = [(text, name) for name, text in P_VALUES.items() if name in result]
         self.map = dropdown("map", MAP, self.known, layout=WIDE)
         self.where = dropdown("where", WHERE, [*tests, (EVERYWHERE, EVERYWHERE)], layout=WIDE)
         self.level = dropdown("level", LEVEL, LEVELS)
@@ -108,26 +112,26 @@ class Maps(Panel):
         return [row(self.map), row(self.where, self.level), self.scene]
 
     def surface(self) -> xr.DataArray:
-        """The positions ``(vertex, xyz)`` of the surface that is shown."""
+        """Return the positions ``(vertex, xyz)`` of the surface that is shown."""
         return self.study["registration"].dataset["position"]
 
     def values(self) -> tuple[np.ndarray, bool, str]:
-        """The map ``(n,)``, whether it has signs, and its unit."""
+        """Return the map ``(n,)``, True if it is signed, and its unit."""
         name = self.map.value
-        data = self.found[name]
+        data = self.result[name]
         values = data.values
         if values.ndim == 2:
             values = (values * self.normals).sum(1)
         return values, name in self.signed, unit_of(data)
 
     def significant(self) -> np.ndarray:
-        """Where the p value is at most the level ``(n,)``; everywhere where none is asked for."""
+        """Return a mask ``(n,)`` of the vertices with p up to the level, or of all vertices."""
         if self.where.value == EVERYWHERE:
             return np.ones(len(self.X), bool)
-        return self.found[self.where.value].values <= self.level.value  # NaN is not
+        return self.result[self.where.value].values <= self.level.value  # False for NaN
 
     def paint(self) -> None:
-        """The map in colours, grey where it is not significant, and how much of it is."""
+        """Colour the surface by the map, grey where it is not significant."""
         values, is_signed, unit = self.values()
         shown = self.significant() & np.isfinite(values)
         limit = float(np.nanquantile(np.abs(values), FULL)) or 1.0
@@ -144,28 +148,28 @@ class Maps(Panel):
         self.scene.caption = self.summary(shown)
 
     def summary(self, shown: np.ndarray) -> str:
-        """How much of the area is significant, and p of the whole shape."""
-        words = []
+        """Return the significant share of the area, and p of the whole shape, as text."""
+        parts = []
         if self.where.value != EVERYWHERE:
             share = 100 * self.area[shown].sum() / self.area.sum()
-            least = np.nanmin(self.found[self.where.value].values)
-            words.append(
+            smallest = np.nanmin(self.result[self.where.value].values)
+            parts.append(
                 f"{share:.1f} % of the area at p ≤ {self.level.value:g} ({self.where.label}), "
-                f"smallest {least:.3g}"
+                f"smallest p {smallest:.3g}"
             )
-        if "p_value" in self.found:
-            words.append(f"whole shape p = {self.found['p_value'].item():.3g}")
-        return "; ".join(words)
+        if "p_value" in self.result:
+            parts.append(f"whole shape p = {self.result['p_value'].item():.3g}")
+        return "; ".join(parts)
 
-    def pick(self, place: dict) -> None:
-        """A vertex that was clicked: its value and p values."""
-        self.vertex = vertex = place["vertex"]
+    def pick(self, picked: dict) -> None:
+        """Show the value and p values at a clicked vertex."""
+        self.vertex = vertex = picked["vertex"]
         values, _, unit = self.values()
         size = f"{values[vertex]:.3g}" + ("" if unit == "1" else f" {unit}")
-        said = [
-            f"p = {self.found[name].values[vertex]:.3g} ({words})"
-            for name, words in P_VALUES.items()
-            if name in self.found
+        p_values = [
+            f"p = {self.result[name].values[vertex]:.3g} ({text})"
+            for name, text in P_VALUES.items()
+            if name in self.result
         ]
         self.scene.mark(self.X[[vertex]])
-        self.scene.caption = "; ".join([f"vertex {vertex}: {self.map.label} {size}", *said])
+        self.scene.caption = "; ".join([f"vertex {vertex}: {self.map.label} {size}", *p_values])

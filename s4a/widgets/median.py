@@ -1,4 +1,4 @@
-"""The median shape (3.5, 3.6, eq. 5): every shape ranked by its distance to the limit shape."""
+"""The median shape (3.5, 3.6, eq. 5): all shapes ranked by their distance to the limit shape."""
 
 import ipywidgets
 import numpy as np
@@ -7,47 +7,54 @@ import traitlets
 from s4a.method.median import NORMS, distance_to_identity, near_ties
 from s4a.show.browser import PARTS
 from s4a.show.surfaces import labelled, names_of, resolutions, surface
-from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
+from s4a.widgets.panel import Panel, columns, dropdown, int_slider, row
 from s4a.widgets.views import Chart
 
 OPERATOR = (
-    "which shape difference is compared with the identity: of areas, or of angles (conformal)"
+    "the shape difference operator that is compared with the identity: area-based or conformal"
 )
 NORM = (
-    "how modes count in the distance to the identity (eq. 5): h2 and h1 damp fine ones, frobenius "
-    "none; h2_image and h2_both also weigh the image"
+    "weights of the eigenfunctions in eq. 5: h2 and h1 damp high frequencies, frobenius does not; "
+    "h2_image and h2_both also weight the image"
 )
-MODES = "how many latent functions the shape differences are cut to"
+EIGENFUNCTIONS = "number of latent eigenfunctions in the shape differences"
 OPERATORS = {"area": "area_difference", "conformal": "conformal_difference"}
 
 
 class Median(Panel):
-    """Ranked distances; a bar that is clicked shows its shape over the median.
+    """Shapes ranked by their distance to the limit shape; the median is the nearest (eq. 5).
+
+    A click on a bar shows its shape with the median as a translucent surface.
 
     Attributes
     ----------
     selected : str
         The shape that is shown.
+
+    See Also
+    --------
+    s4a.widgets.Network : the maps that the shape differences come from.
     """
 
     needs = ("latent/area_difference", "latent/latent_eigenvalue")
     title = "Median shape"
     selected = traitlets.Unicode("")
-    live = (("operator", "norm", "modes", "shape"),)
+    live = (("operator", "norm", "size", "shape"),)
     clicks = (("bars", "name", "shape"),)
     shares = ("selected",)
 
     def build(self) -> list[ipywidgets.Widget]:
-        """Choices, bars and the surface."""
+        """Return the controls, the bars and the view of the surface."""
         latent = self.study["latent"].dataset
-        self.names, n_modes = names_of(latent), latent.sizes["latent"]
+        self.names, k = names_of(latent), latent.sizes["latent"]
         norm, options = str(latent.attrs.get("norm", "h2")), labelled(self.study, self.names)
-        self.operator = self.choose(dropdown("operator", OPERATOR, list(OPERATORS)), self.rank)
-        self.norm = self.choose(dropdown("norm", NORM, list(NORMS), value=norm), self.rank)
-        self.modes = self.choose(int_slider("modes K", MODES, n_modes, 2, n_modes), self.rank)
-        stages = dropdown("surfaces", "which meshes are drawn", resolutions(self.study))
-        self.stage = self.choose(stages, self.show)
-        self.shape = dropdown("shape", "what is shown beside the bars", options)
+        self.operator = self.redrawing(dropdown("operator", OPERATOR, list(OPERATORS)), self.rank)
+        self.norm = self.redrawing(dropdown("norm", NORM, list(NORMS), value=norm), self.rank)
+        size = int_slider("eigenfunctions K", EIGENFUNCTIONS, k, 2, k)
+        self.size = self.redrawing(size, self.rank)
+        stages = dropdown("surfaces", "the resolution of the meshes", resolutions(self.study))
+        self.stage = self.redrawing(stages, self.show)
+        self.shape = dropdown("shape", "the shape that is shown", options)
         self.bars, self.ties = Chart(), ipywidgets.HTML()
         self.scene = self.new_scene(420)
         self.on_pick(self.bars, self.pick)
@@ -56,39 +63,38 @@ class Median(Panel):
         self.rank()
         self.selected = self.median
         return [
-            row(self.operator, self.norm, self.modes),
+            row(self.operator, self.norm, self.size),
             row(self.shape, self.stage),
             self.ties,
-            beside(self.bars, self.scene),
+            columns(self.bars, self.scene),
         ]
 
     def selection(self) -> dict:
-        """The shape that is shown."""
+        """Return the shape that is shown."""
         return {"shape": self.selected}
 
     def adopt(self, pair: tuple[str, str], shape: str) -> None:
-        """Show a shape that is ranked."""
+        """Show the shape if it is ranked."""
         if shape in self.names:
             self.selected = shape
 
     def rank(self) -> None:
-        """Distances for the operator, norm and number of modes that are chosen."""
-        latent, k = self.study["latent"].dataset, self.modes.value
+        """Compute the distances for the selected operator, norm and number of eigenfunctions."""
+        latent, k = self.study["latent"].dataset, self.size.value
         D = latent[OPERATORS[self.operator.value]].values[:, :k, :k]
         eigenvalues = latent["latent_eigenvalue"].values[:k]
         self.distance = distance_to_identity(D, eigenvalues, self.norm.value)
         self.order = np.argsort(self.distance, kind="stable")
         near = [self.names[i] for i in near_ties(self.distance)][1:]
-        others = f"Near ties, at most 5 % farther: {', '.join(near)}."
-        self.median, least = self.names[self.order[0]], f"{self.distance.min():.4g}"
-        others = others if near else "No other within 5 %."
-        self.ties.value = PARTS.median(self.median, least, others)
+        ties = f"Near ties, at most 5 % larger: {', '.join(near)}." if near else "No near ties."
+        self.median, distance = self.names[self.order[0]], f"{self.distance.min():.4g}"
+        self.ties.value = PARTS.median(self.median, distance, ties)
         self.draw_bars()
         if self.selected:
             self.show()
 
     def draw_bars(self) -> None:
-        """The bars, nearest first; the median is orange, the selected one outlined."""
+        """Draw the bars, nearest first; the median is orange, the selected shape outlined."""
         names = [self.names[i] for i in self.order]
         self.bars.draw(
             "bars",
@@ -101,11 +107,11 @@ class Median(Panel):
         )
 
     def pick(self, mark: dict) -> None:
-        """The bar that was clicked."""
+        """Select the shape of the clicked bar."""
         self.selected = self.names[self.order[mark["index"]]]
 
     def show(self) -> None:
-        """The selected shape, with the median shining through around it."""
+        """Show the selected shape with the median as a translucent surface."""
         name = self.selected
         self.draw_bars()
         i = self.names.index(name)
@@ -114,8 +120,8 @@ class Median(Panel):
         title, ghost, stage = f"{name}, the median", (), self.stage.value
         if name != self.median:
             title = f"{name}, in {self.median}"
-            caption += "; blue, shining through: the median"
+            caption += "; translucent blue: the median"
             ghost = surface(self.study, self.median, stage)
         self.scene.show(*surface(self.study, name, stage), title=title)
-        self.scene.over(*ghost)
+        self.scene.overlay(*ghost)
         self.scene.caption = caption

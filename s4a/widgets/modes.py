@@ -1,4 +1,4 @@
-"""Principal modes of variation (6.1, Fig. 4 and 5): sliders that deform the mean shape."""
+"""Modes of variation (6.1, Fig. 4 and 5): sliders that deform the mean shape."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from s4a.geometry.mesh import vertex_normals
 from s4a.input.files import write_mesh
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import apply_scores, mahalanobis, plausible_scores
-from s4a.show.browser import MODES, look_state, mesh_state, to_bytes
+from s4a.show.browser import MODES, appearance_state, mesh_state, to_bytes
 from s4a.show.draw import signed_colors
 from s4a.show.surfaces import (
     N_LIVE,
@@ -24,25 +24,25 @@ from s4a.show.surfaces import (
 from s4a.widgets.panel import Panel, dropdown, file_name, row
 from s4a.widgets.views import View
 
-LARGE = 40e6  # bytes of modes from which the low resolution is shown first
+LARGE = 40e6  # bytes of the deformations above which the default is the low resolution
 BARE = (".obj", ".off", ".stl")  # formats without values at the vertices
 
 
 class ModesView(View):
-    """Sliders, shape and charts; only the scores come back, some hundred bytes a step.
+    """Sliders, shape and charts in the browser, which sends only the scores to the kernel.
 
     Attributes
     ----------
     scores : list of float
-        In standard deviations, one for each component; set them and the shape follows.
+        Score of each mode of variation, in standard deviations; the shape follows them.
     sample : int
         The shape that was clicked last, -1 for none.
     colors : {"normal", "magnitude", "none", "own"}
     own : bytes
-        Colours of the vertices that are there to choose, as of
+        Colours of the vertices for ``colors="own"``, made by
         :func:`s4a.show.browser.color_bytes`; none by default.
-    beside : bool
-        Whether the marked component is shown at -3, 0 and 3 standard deviations, side by side.
+    side_by_side : bool
+        If True, the marked mode is shown at -3, 0 and 3 standard deviations.
     """
 
     _esm = MODES
@@ -62,7 +62,7 @@ class ModesView(View):
     faint = traitlets.List().tag(sync=True)
     colors = traitlets.Enum(["normal", "magnitude", "none", "own"], "normal").tag(sync=True)
     own = traitlets.Bytes().tag(sync=True)
-    beside = traitlets.Bool(False).tag(sync=True)
+    side_by_side = traitlets.Bool(False).tag(sync=True)
     sample = traitlets.Int(-1).tag(sync=True)
     height = traitlets.Int(420).tag(sync=True)
 
@@ -72,14 +72,14 @@ class ModesView(View):
         self.arrays = mean, triangles, deformation
         super().__init__(
             **mesh_state(mean, triangles, deformation),
-            **look_state(limits, unit, view, up),
+            **appearance_state(limits, unit, view, up),
             scores=[0.0] * len(deformation),
             **options,
         )
         self.observe(self.draw_still, ["webgl", "scores", "colors"])
 
     def change_mesh(self, mean: np.ndarray, triangles: np.ndarray, deformation: np.ndarray) -> None:
-        """Other vertices of the same shapes, in one message."""
+        """Replace the mesh by one with other vertices, in one message."""
         self.arrays = mean, triangles, deformation
         with self.hold_sync():
             for name, value in mesh_state(*self.arrays).items():
@@ -87,13 +87,13 @@ class ModesView(View):
         self.draw_still()
 
     def change_triangles(self, triangles: np.ndarray) -> None:
-        """Other triangles of the same vertices, as where a part of them is not seen."""
+        """Replace the triangles, for example to hide some of them."""
         self.arrays = self.arrays[0], triangles, self.arrays[2]
         self.corner = to_bytes(triangles, "uint32")
         self.draw_still()
 
     def drawn(self) -> tuple | None:
-        """The shape as the sliders stand, coloured by how far it moved along the mean's normals."""
+        """Return the deformed shape, coloured by the displacement along the mean's normals."""
         mean, triangles, deformation = self.arrays
         moved = apply_scores(mean, deformation, self.scores)
         if self.colors == "own" and self.own:
@@ -105,24 +105,31 @@ class ModesView(View):
 
 
 class Modes(Panel):
-    """A slider per mode, in standard deviations, that deforms the mean shape in the browser.
+    """Sliders, one per mode of variation, that deform the mean shape in the browser.
 
     Parameters
     ----------
     study : xarray.DataTree
         With ``/registration`` and ``/pca``.
     resolution : {None, "full", "coarse"}
-        Which vertices of the template; by default the full resolution, unless its modes are more
-        than 40 MB.
+        Resolution of the template; by default full, unless the deformations exceed 40 MB.
     n_modes : int
-        How many modes, the first, where there are as many.
+        Largest number of modes of variation, the first ones.
     view, up
-        From where the shape is seen first; see :func:`s4a.show.draw.rotation`.
+        Initial direction of view; see :func:`s4a.show.draw.rotation`.
 
     Attributes
     ----------
     scores : list of float
-        One for each mode, in standard deviations.
+        Score of each mode of variation, in standard deviations.
+
+    See Also
+    --------
+    s4a.write_picture, s4a.write_film : modes of variation as a picture or a film.
+
+    References
+    ----------
+    Cootes et al., "Active shape models: their training and application", CVIU 61(1), 1995.
     """
 
     needs = ("registration/position", "pca/deformation")
@@ -131,7 +138,7 @@ class Modes(Panel):
     python = ("saving the mesh",)
 
     def build(self, resolution: str | None = None, n_modes: int = N_LIVE) -> list:
-        """Sliders, shape and charts in the browser; below them resolution and export."""
+        """Return the view with its sliders and charts, and controls of resolution and export."""
         self.n_modes = n_modes
         self.coarse = template_coarse(self.study)
         sizes = {"full": self.study["registration"].sizes["vertex"]}
@@ -140,51 +147,52 @@ class Modes(Panel):
         if resolution is None:
             deformation = self.study["pca"]["deformation"].isel(component=slice(n_modes))
             resolution = list(sizes)[-1] if deformation.nbytes > LARGE else "full"
-        look: dict[str, Any] = score_state(self.study, n_modes) | self.camera
+        state: dict[str, Any] = score_state(self.study, n_modes) | self.camera
         unit = unit_text(self.study, attribute(self.study, "registration", "template"))
         arrays, limits = self.arrays(resolution), mode_limits(self.study)
-        self.view = ModesView(*arrays, limits=limits, unit=unit, **look)
+        self.view = ModesView(*arrays, limits=limits, unit=unit, **state)
         traitlets.link((self.view, "scores"), (self, "scores"))
         options = [(f"{name}, {size:,} vertices", name) for name, size in sizes.items()]
         self.resolution = dropdown(
-            "resolution", "which vertices are moved", options, value=resolution
+            "resolution", "resolution of the deformed mesh", options, value=resolution
         )
         self.on_change(self.resolution, lambda name: self.view.change_mesh(*self.arrays(name)))
         self.path = file_name("shape.ply")
-        mesh_help = "the shape as it stands, at full resolution"
-        self.ply = self.saving("Save mesh", lambda: self.save_mesh(self.path.value), mesh_help)
-        page_help = "one HTML file with these sliders, for offline"
-        self.html = self.saving("Save page", lambda: self.save_html(self.page_path()), page_help)
+        mesh_help = "the current shape at full resolution"
+        self.ply = self.save_button("Save mesh", lambda: self.save_mesh(self.path.value), mesh_help)
+        page_help = "one HTML file that needs no kernel"
+        self.html = self.save_button(
+            "Save page", lambda: self.save_html(self.page_path()), page_help
+        )
         return [self.view, row(self.resolution, self.path, self.ply, self.html)]
 
     def arrays(self, resolution: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean shape, triangles and deformations at the resolution."""
+        """Return mean shape, triangles and deformations at a resolution."""
         return mode_arrays(self.study, None if resolution == "full" else self.coarse, self.n_modes)
 
     def page_path(self) -> Path:
-        """The name of the page beside that of the mesh."""
+        """Return the path of the page, which has the name of the mesh."""
         return Path(self.path.value).with_suffix(".html")
 
     def vertices(self, resolution: str = "full") -> np.ndarray:
-        """Vertices ``(n, 3)`` of the shape as the sliders stand, in the unit of the input."""
+        """Return the vertices ``(n, 3)`` of the current shape, in the unit of the input."""
         mean, _, deformation = self.arrays(resolution)
         return apply_scores(mean, deformation, np.array(self.scores))
 
     @property
     def distance(self) -> float:
-        """Mahalanobis distance of the shape from the mean."""
+        """Mahalanobis distance of the current shape from the mean."""
         return mahalanobis(np.array(self.scores))
 
     def random(self, seed: int | None = None) -> list[float]:
-        """A plausible shape: set scores drawn from the normal distribution, and give them."""
+        """Draw scores from the normal distribution, set and return them."""
         self.scores = plausible_scores(len(self.scores), seed=seed).tolist()
         return self.scores
 
     def save_mesh(self, path: Path | str) -> Path:
-        """Write the shape as the sliders stand, at full resolution.
+        """Write the current shape at full resolution, in a format of :func:`s4a.write_mesh`.
 
-        In any format of :func:`s4a.write_mesh`, with its displacement along the mean's normals
-        where the format has values at the vertices.
+        A format with values at the vertices also gets the displacement along the mean's normals.
         """
         path = Path(path)
         mean, T, _ = self.arrays("full")

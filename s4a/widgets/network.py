@@ -1,4 +1,4 @@
-"""The network of maps (3.4): shapes, the maps among them, and how well they close their cycles."""
+"""The network of functional maps (3.4): shapes as nodes, maps as edges, and cycle errors."""
 
 import ipywidgets
 import numpy as np
@@ -15,11 +15,11 @@ from s4a.show.surfaces import (
     flagged_names,
     labelled,
     network_limits,
-    network_places,
+    network_positions,
     surface,
 )
 from s4a.study.tree import excluded_of
-from s4a.widgets.panel import Panel, beside, dropdown, int_slider, row
+from s4a.widgets.panel import Panel, columns, dropdown, int_slider, row
 from s4a.widgets.views import DIRECTION, Chart
 
 STAGES = [
@@ -27,28 +27,26 @@ STAGES = [
     ("after Consistent ZoomOut", "cycle_error"),
 ]
 WHICH = (
-    "colour of a map: its cycle error, that is how far compositions with other maps are from the "
+    "colour of an edge: its cycle error, the distance of compositions along cycles from the "
     "identity; before or after Consistent ZoomOut"
 )
-BUDGET = (
-    "how many pairs of shapes have maps: those of nearest spectra, and what keeps all connected"
+BUDGET = "number of pairs with maps: those of most similar spectra, and a spanning tree"
+POSITIONS = (
+    "positions of the nodes: on a circle, or first two principal components of the shape "
+    "differences"
 )
-PLACES = (
-    "where the shapes stand: on a circle, or by the first two components of their shape differences"
-)
-SHOW = "a shape, or a map between two of them"
+SHOW = "a shape, or a map between two shapes"
 NARROW = {"width": "20em"}
-MOST = 100  # shapes that a graph shows
-UNKNOWN = "unknown: in no cycle"
+MOST = 100  # nodes of a graph
+UNKNOWN = "unknown (in no cycle)"
 ERRORS = "cycle error (logarithmic)"
 
 
 class Network(Panel):
     """Shapes as nodes, maps as edges coloured by cycle error; a click shows the meshes and the map.
 
-    Of more than a hundred shapes the graph has the median, the one that is shown, and those that
-    the fewest maps lead to from there; the numbers beside it are of all, and maps are chosen by a
-    click.
+    Of more than a hundred shapes the graph shows the selected shape, the median, and the shapes
+    with the shortest paths from them.  The numbers next to it are of all shapes.
 
     Attributes
     ----------
@@ -56,6 +54,14 @@ class Network(Panel):
         Row of ``/network`` that is shown, -1 for none.
     node : str
         The shape that is shown alone, "" for none.
+
+    See Also
+    --------
+    s4a.widgets.FunctionalMap : the matrix of a map and its eigenfunctions.
+
+    References
+    ----------
+    Huang et al., "Limit shapes", Computer Graphics Forum 38(5), 2019.
     """
 
     needs = tuple(
@@ -69,7 +75,7 @@ class Network(Panel):
     shares = ("edge", "node")
 
     def build(self) -> list[ipywidgets.Widget]:
-        """Choices, graph, matrix and two surfaces."""
+        """Return the controls, the graph, the matrix and the views of two surfaces."""
         network = self.study["network"].dataset
         self.source, self.target = (network[key].values.astype(str) for key in ("source", "target"))
         names, ends = np.unique([self.source, self.target], return_inverse=True)
@@ -78,7 +84,7 @@ class Network(Panel):
         self.median = attribute(self.study, "latent", "median")
         self.flagged = set(flagged_names(self.study))
         spectra = [self.study["coarse"][name]["eigenvalue"].values for name in self.names]
-        k = network.sizes["eigenpair_source_initial"]  # by as many the study chose its pairs
+        k = network.sizes["eigenpair_source_initial"]  # as in the choice of pairs of the study
         self.distance = spectral_distance([values[:k] for values in spectra])
         n, self.used = len(self.names), len(set(self.pairs))  # pairs that have maps
         most = max(n - 1, n * (n - 1) // 2)
@@ -89,47 +95,48 @@ class Network(Panel):
         self.stage = dropdown("colours", WHICH, STAGES, layout={"width": "23em"})
         self.budget = int_slider("pairs", BUDGET, self.used, n - 1, most, continuous_update=True)
         self.choice = dropdown("show", SHOW, options, layout=NARROW)
-        self.where = dropdown("places", PLACES, ["circle", "shape differences"], layout=NARROW)
+        arrangements = ["circle", "shape differences"]
+        self.where = dropdown("positions", POSITIONS, arrangements, layout=NARROW)
         self.facts, self.bar = ipywidgets.HTML(), ipywidgets.HTML()
         self.graph, self.matrix = Chart(), Chart()
         self.scenes = [self.new_scene(185), self.new_scene(185)]
         self.redraw(self.draw, self.where, self.budget)
         self.redraw(self.change_stage, self.stage)
-        self.on_change(self.choice, self.choose)
-        self.on_pick(self.graph, lambda mark: self.choose(mark.get("edge", mark.get("node"))))
+        self.on_change(self.choice, self.select)
+        self.on_pick(self.graph, lambda mark: self.select(mark.get("edge", mark.get("node"))))
         self.on_change(self, self.show_edge, "edge")
         self.on_change(self, self.show_node, "node")
         self.draw()
         self.node = self.median or self.names[0]
-        columns = ipywidgets.VBox([self.graph, self.bar]), self.matrix, ipywidgets.VBox(self.scenes)
+        parts = ipywidgets.VBox([self.graph, self.bar]), self.matrix, ipywidgets.VBox(self.scenes)
         return [
             row(self.stage, self.choice, self.where),
             row(self.budget, self.facts),
-            beside(*columns, least="20em"),
+            columns(*parts, min_width="20em"),
         ]
 
     def selection(self) -> dict:
-        """The pair whose map is shown, or the shape that is shown alone."""
+        """Return the pair whose map is shown, or the shape that is shown alone."""
         if self.edge < 0:
             return {"pair": ("", ""), "shape": self.node}
         return {"pair": (str(self.source[self.edge]), str(self.target[self.edge]))}
 
     def adopt(self, pair: tuple[str, str], shape: str) -> None:
-        """Show the map of a pair that has one; a shape where no map is shown."""
-        for found in np.flatnonzero((self.source == pair[0]) & (self.target == pair[1])):
-            self.edge = int(found)
+        """Show the map of the pair, if it has one; else the shape, if no map is shown."""
+        for edge in np.flatnonzero((self.source == pair[0]) & (self.target == pair[1])):
+            self.edge = int(edge)
         if self.edge < 0 and shape in self.names:
             self.node = shape
 
-    def places(self, names: list[str]) -> np.ndarray:
-        """Places ``(n, 2)`` of shapes, by their differences or on a circle."""
-        places = None
+    def positions(self, names: list[str]) -> np.ndarray:
+        """Return positions ``(n, 2)`` of nodes, by shape differences or on a circle."""
+        positions = None
         if self.where.value == "shape differences":
-            places = network_places(self.study, names)
-        return charts.on_circle(len(names)) if places is None else places
+            positions = network_positions(self.study, names)
+        return charts.on_circle(len(names)) if positions is None else positions
 
     def drawn_shapes(self, pairs: np.ndarray) -> np.ndarray:
-        """The shapes that the graph of some pairs shows, by their numbers in `names` ``(n,)``."""
+        """Return the shapes in the graph of some pairs, as indices of `names` ``(n,)``."""
         if len(self.names) <= MOST:
             return np.arange(len(self.names))
         first = [self.node] if self.edge < 0 else [self.source[self.edge], self.target[self.edge]]
@@ -139,13 +146,13 @@ class Network(Panel):
         return nearest_by_maps(pairs, len(self.names), known, MOST)
 
     def budgeted(self) -> np.ndarray:
-        """The pairs that the budget allows ``(p, 2)``: those of the study, or of another choice."""
+        """Return the pairs ``(p, 2)`` within the budget: those of the study, or another choice."""
         if self.budget.value == self.used:
             return np.unique(self.pairs, axis=0)
         return choose_pairs(self.distance, self.budget.value)
 
     def draw(self) -> None:
-        """The graph with the pairs that the budget allows, on one colour scale before and after."""
+        """Draw the graph of the pairs within the budget, on one colour scale before and after."""
         network = self.study["network"].dataset
         low, high = network_limits(self.study)
         pairs = self.budgeted()
@@ -153,14 +160,14 @@ class Network(Panel):
         self.allowed = [i for i, pair in enumerate(self.pairs) if pair in allowed]
         drawn = self.drawn_shapes(pairs)
         names = [self.names[i] for i in drawn]
-        place = np.full(len(self.names), -1)
-        place[drawn] = np.arange(len(drawn))
-        between = (place[self.ends] >= 0).all(axis=1)  # maps of which both shapes are drawn
+        index = np.full(len(self.names), -1)  # in the graph
+        index[drawn] = np.arange(len(drawn))
+        between = (index[self.ends] >= 0).all(axis=1)  # maps of which both shapes are drawn
         self.shown = [i for i in self.allowed if between[i]]
         values = network[self.stage.value].values
         colors = cycle_error_colors(values[self.shown], (low, high))
-        source, target = place[self.ends[self.shown]].T
-        x, y = self.places(names).T
+        source, target = index[self.ends[self.shown]].T
+        x, y = self.positions(names).T
         n = len(self.names)
         part = "" if len(names) == n else f" (the nearest {len(names)} of {n:,})"
         self.graph.draw(
@@ -182,45 +189,44 @@ class Network(Panel):
             edge=self.edge,
             edges=self.shown,
         )
-        self.tell(pairs, values[self.allowed])
+        self.show_facts(pairs, values[self.allowed])
         scale = color_scale(CYCLE_ERROR, low, high, ERRORS)
         self.bar.value = PARTS.color_bar(scale["colors"], f"{low:.2g}", f"{high:.2g}", ERRORS)
 
-    def tell(self, pairs: np.ndarray, values: np.ndarray) -> None:
-        """Numbers of the graph of some pairs, whose maps have these cycle errors."""
+    def show_facts(self, pairs: np.ndarray, values: np.ndarray) -> None:
+        """Show connectivity and cycle errors of the graph of some pairs."""
         facts, known = connectivity(pairs, len(self.names)), values[np.isfinite(values)]
-        apart = excluded_of(self.study["registration"]) if "registration" in self.study else []
+        excluded = excluded_of(self.study["registration"]) if "registration" in self.study else []
         few = len(self.allowed) < 2 * len(pairs)
-        words = [
-            f"{len(pairs)} pairs" + f", {len(self.allowed)} maps of them in the study" * few,
+        parts = [
+            f"{len(pairs)} pairs" + f", the study has {len(self.allowed)} maps of them" * few,
             f": {'connected' if facts['components'] == 1 else 'NOT connected'}, ",
             f"{facts['triangles']} triangles, {facts['in_no_triangle']} shapes in none, ",
-            f"smallest degree {facts['smallest_degree']}, ",
-            f"at most {facts['diameter']} maps apart",
+            f"smallest degree {facts['smallest_degree']}, diameter {facts['diameter']}",
         ]
         if len(known):
-            words.append(f"; cycle errors {known.min():.3f} to {known.max():.3f}, ")
-            words.append(f"median {np.median(known):.3f}")
-        if apart:
-            words.append(f"; beside it, flagged: {', '.join(apart)}")
-        self.facts.value = PARTS.paragraph("".join(words))
+            parts.append(f"; cycle errors {known.min():.3f} to {known.max():.3f}, ")
+            parts.append(f"median {np.median(known):.3f}")
+        if excluded:
+            parts.append(f"; excluded (flagged): {', '.join(excluded)}")
+        self.facts.value = PARTS.paragraph("".join(parts))
 
     def change_stage(self) -> None:
-        """Maps before or after Consistent ZoomOut."""
+        """Show the maps before or after Consistent ZoomOut."""
         if self.edge >= 0:
             self.show_edge(self.edge)
         else:
             self.draw()
 
-    def choose(self, what: int | str) -> None:
-        """A map by its row of ``/network``, or a shape by its name."""
-        if isinstance(what, str):
-            self.node = what
+    def select(self, item: int | str) -> None:
+        """Select a map by its row of ``/network``, or a shape by its name."""
+        if isinstance(item, str):
+            self.node = item
         else:
-            self.edge = what
+            self.edge = item
 
     def show_node(self, name: str) -> None:
-        """One shape."""
+        """Show a shape."""
         if not name:
             return
         self.edge = -1
@@ -228,12 +234,12 @@ class Network(Panel):
         scene, other = self.scenes
         self.matrix.layout.display = other.layout.display = "none"
         scene.show(*surface(self.study, name), title=name)
-        starts, ends = (self.source == name).sum(), (self.target == name).sum()
-        scene.caption = f"{starts} maps from it, {ends} to it"
+        n_from, n_to = (self.source == name).sum(), (self.target == name).sum()
+        scene.caption = f"{n_from} maps from this shape, {n_to} to it"
         self.draw()
 
     def show_edge(self, edge: int) -> None:
-        """A map: its matrix, and the colours that it carries from source to target."""
+        """Show a map: its matrix, and the colours that it transfers from source to target."""
         if edge < 0:
             return
         if len(self.names) <= MOST:
@@ -255,7 +261,7 @@ class Network(Panel):
         error = UNKNOWN if np.isnan(error) else f"{error:.3f}"
         on_source.caption = "its coordinates as colours"
         on_target.caption = (
-            f"the colours that the map carries; cycle error {error}, weight {weight:.2f} in "
+            f"the colours transferred by the map; cycle error {error}, weight {weight:.2f} in "
             "Consistent ZoomOut"
         )
         self.draw()

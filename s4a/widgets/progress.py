@@ -1,4 +1,4 @@
-"""An analysis in a process of its own: how far each stage is, cancelled or opened while it runs."""
+"""An analysis in its own process: progress of each stage, cancelled or opened while it runs."""
 
 import contextlib
 import multiprocessing
@@ -25,19 +25,19 @@ Shapes = Path | str | list[Path | str] | dict[str, Any] | xr.DataTree
 
 
 def work(answer: Any, shapes: Any, options: dict[str, Any]) -> None:
-    """Analyse, in the process of its own; the answer is the error's text, empty without one."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # its own bars would be written below the panel
+    """Analyse in the child process, and send the text of the error, empty for none."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # hide the progress bars of the child process
     try:
         analyse(shapes, **options)
         answer.send("")
     except KeyboardInterrupt:
         answer.send("cancelled")
-    except Exception as error:  # whatever it is, the panel must show it
+    except Exception as error:  # the panel must show any error
         answer.send(f"{type(error).__name__}: {error}")
 
 
 def clock(seconds: float) -> str:
-    """Minutes and seconds.
+    """Format a duration as minutes and seconds.
 
     Examples
     --------
@@ -48,33 +48,34 @@ def clock(seconds: float) -> str:
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
-def told(found: Status) -> str:
-    """What a run takes now, and the shapes that it left out, with the reason."""
+def status_text(run: Status) -> str:
+    """Return processes and memory of a run, and the shapes that failed with the reason."""
     text = ""
-    if found.state == "running":
-        text += f"; processes: {found.processes}, {found.memory:.0f} MiB now"
-    return text + "".join(f"; left out {name}: {why}" for name, why in found.failures.items())
+    if run.state == "running":
+        text += f"; processes: {run.processes}, {run.memory:.0f} MiB now"
+    return text + "".join(f"; left out {name}: {why}" for name, why in run.failures.items())
 
 
 class Progress(Panel):
-    """Runs :func:`s4a.analyse` in a process of its own and shows how far it is.
-
-    Its lines are those of ``s4a status``.
+    """Run :func:`s4a.analyse` in its own process and show the progress of each stage.
 
     Parameters
     ----------
     shapes : see :func:`s4a.analyse`
     store : path
-        Folder of the study; a cancelled run goes on where it stopped when it is started with the
-        same.
+        Folder of the study; a cancelled run resumes when it is started with the same folder.
     **options
-        Of :func:`s4a.analyse`.
+        Options of :func:`s4a.analyse`.
 
     Attributes
     ----------
     state : {"running", "finished", "cancelled", "failed"}
     explored : Explore or None
-        The panels, once they were opened.
+        The panels, once they have been opened.
+
+    See Also
+    --------
+    s4a.analyse : the same analysis in this process.
     """
 
     title = "Progress"
@@ -87,53 +88,53 @@ class Progress(Panel):
         self.start()
 
     def start(self) -> None:
-        """Run, from the beginning or where it stopped."""
-        self.say("")
+        """Start or resume the run."""
+        self.show_message("")
         self.view.disabled = not self.ready()
         self.state, self.stopped, self.started = "running", threading.Event(), time.monotonic()
         context = multiprocessing.get_context("spawn")
         try:
-            self.answer, there = context.Pipe(duplex=False)
+            self.answer, sender = context.Pipe(duplex=False)
         except ImportError as error:
             raise ImportError(
-                "Progress runs the analysis in a process of its own, and this kernel cannot start "
-                "one, as in a browser: call s4a.analyse instead"
+                "Progress runs the analysis in its own process, which this kernel cannot start (as "
+                "in a browser): call s4a.analyse instead"
             ) from error
-        self.process = context.Process(target=work, args=(there, *self.arguments))
+        self.process = context.Process(target=work, args=(sender, *self.arguments))
         self.process.start()
-        there.close()
-        self.stop.disabled, self.go_on.disabled = False, True
+        sender.close()
+        self.stop.disabled, self.resume.disabled = False, True
         threading.Thread(target=self.watch, args=(self.stopped,), daemon=True).start()
 
     def build(self) -> list[ipywidgets.Widget]:
-        """A bar for each stage, and the buttons."""
-        wide = {"flex": "1 1 22em", "width": "auto", "min_width": "0", "max_width": "37em"}
-        look = {"max": 1, "style": {"description_width": "min(18em, 60%)"}, "layout": wide}
-        self.bars = {stage: ipywidgets.IntProgress(description=stage, **look) for stage in STAGES}
+        """Return a progress bar for each stage, and the buttons."""
+        layout = {"flex": "1 1 22em", "width": "auto", "min_width": "0", "max_width": "37em"}
+        options = {"max": 1, "style": {"description_width": "min(18em, 60%)"}, "layout": layout}
+        self.bars = {name: ipywidgets.IntProgress(description=name, **options) for name in STAGES}
         self.texts = {stage: ipywidgets.HTML(layout={"flex": "1 1 12em"}) for stage in STAGES}
         self.total = ipywidgets.HTML()
-        self.stop = self.button("Cancel", self.cancel, "what is finished stays and is used again")
-        self.go_on = self.button("Resume", self.start, "where it stopped", disabled=True)
-        self.view = self.button("Open", self.show, "the stages that are finished")
-        lines = [row(self.bars[stage], self.texts[stage]) for stage in STAGES]
-        return [*lines, row(self.stop, self.go_on, self.view, self.total)]
+        self.stop = self.button("Cancel", self.cancel, "stop the run; finished tasks are kept")
+        self.resume = self.button("Resume", self.start, "resume the run", disabled=True)
+        self.view = self.button("Open", self.show, "show the finished stages")
+        rows = [row(self.bars[stage], self.texts[stage]) for stage in STAGES]
+        return [*rows, row(self.stop, self.resume, self.view, self.total)]
 
     def watch(self, stopped: threading.Event) -> None:
-        """Look at the folder until the process ends, in a thread of its own."""
+        """Poll the folder until the process ends; runs in its own thread."""
         while self.process.is_alive() and not stopped.wait(EVERY):
-            self.guarded(self.look)()
+            self.guarded(self.update)()
         if not stopped.is_set():
             self.guarded(self.finish)()
 
-    def look(self) -> None:
-        """Show how far every stage is, by what the run notes, and who was left out."""
+    def update(self) -> None:
+        """Show the progress of every stage and the shapes that failed, by the run's notes."""
         text = f"{self.state}, {clock(time.monotonic() - self.started)}"
-        with contextlib.suppress(ValueError):  # nothing is noted yet
-            found = status(self.folder)
-            if found.owner == self.process.pid:  # not by the run before it
-                for name, stage in found.stages.items():
+        with contextlib.suppress(ValueError):  # no notes yet
+            run = status(self.folder)
+            if run.owner == self.process.pid:  # not of the previous run
+                for name, stage in run.stages.items():
                     self.show_stage(name, stage)
-                text += told(found)
+                text += status_text(run)
         self.total.value = PARTS.paragraph(text)
         ready = self.ready()
         self.view.disabled = not ready
@@ -142,49 +143,49 @@ class Progress(Panel):
             self.explored.extend(open_study(self.folder))
 
     def show_stage(self, name: str, stage: Stage) -> None:
-        """How far a stage is, what it took, and how long it takes by its pace so far."""
+        """Show the progress of a stage, its time and memory, and the estimated time left."""
         bar, now = self.bars[name], time.time()
         bar.max, bar.value = max(stage.all, 1), stage.done if stage.all else stage.ended
         bar.bar_style = "success" if stage.ended else "info"
-        goes_on = self.state == "running" and not stage.ended
+        running = self.state == "running" and not stage.ended
         text = f"{stage.done} of {stage.all}"
-        text += f", {clock(stage.seconds + goes_on * (now - stage.begun))}"
+        text += f", {clock(stage.seconds + running * (now - stage.begun))}"
         if stage.ended and np.isfinite(stage.memory):
             text += f", {stage.memory:.0f} MiB"
-        if goes_on and np.isfinite(left := stage.remaining(now)):
+        if running and np.isfinite(left := stage.remaining(now)):
             text += f", about {clock(left)} left"
         self.texts[name].value = text
 
     def ready(self) -> list[str]:
-        """The stages that have ended."""
+        """Return the finished stages."""
         return [stage for stage, bar in self.bars.items() if bar.bar_style == "success"]
 
     def finish(self) -> None:
-        """What the process said at its end."""
+        """Show how the process ended."""
         self.process.join()
-        said = f"the process ended with code {self.process.exitcode}"
+        message = f"the process ended with code {self.process.exitcode}"
         with contextlib.suppress(EOFError):
             if self.answer.poll():
-                said = self.answer.recv()
+                message = self.answer.recv()
         if self.state == "running":
-            self.state = {"": "finished", "cancelled": "cancelled"}.get(said, "failed")
-        self.look()
+            self.state = {"": "finished", "cancelled": "cancelled"}.get(message, "failed")
+        self.update()
         if self.state == "failed":
-            self.say(said, error=True)
-        self.stop.disabled, self.go_on.disabled = True, self.state == "finished"
+            self.show_message(message, error=True)
+        self.stop.disabled, self.resume.disabled = True, self.state == "finished"
 
     def cancel(self) -> None:
-        """End the process; the files that it wrote stay."""
+        """End the process; the files that it wrote are kept."""
         self.state = "cancelled"
         if self.process.pid and self.process.is_alive():
             os.kill(self.process.pid, signal.SIGINT)
             self.process.join(5)
             if self.process.is_alive():
                 self.process.terminate()
-        self.say("cancelled; Resume, or the same store, goes on where it stopped")
+        self.show_message("cancelled; press Resume, or start again with the same store")
 
     def show(self) -> None:
-        """Open the panels of what is finished; they fill as other stages end."""
+        """Open the panels of the finished stages; others are filled when their stage ends."""
         self.opened = self.ready()
         study = open_study(self.folder)
         if self.explored is None:
@@ -194,7 +195,7 @@ class Progress(Panel):
             self.explored.refresh(study)
 
     def close(self) -> None:
-        """Cancel a run that goes on, and close everything."""
+        """Cancel a running analysis, and close all widgets."""
         self.stopped.set()
         if hasattr(self, "process") and self.process.is_alive():
             self.cancel()

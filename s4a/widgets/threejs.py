@@ -1,9 +1,10 @@
-"""Surfaces as pythreejs objects, for scenes of your own.
+"""Surfaces as pythreejs objects, for custom scenes.
 
-Every function gives pythreejs objects, which take lights, sprites, arrows, cameras and materials
-of your own; :func:`renderer` puts them into a scene that can be turned.  The panels keep a small
-renderer of their own: one WebGL context for all views of a page, picking, a keyboard cursor, and
-saved pages of some kB.  pythreejs bundles three.js of 2018, and a page shows eight scenes at once.
+The functions return pythreejs objects, which can be combined with other lights, sprites, arrows,
+cameras and materials; :func:`renderer` puts them into a scene that can be rotated.  The panels use
+their own small renderer instead, with one WebGL context for all views of a page, picking, a
+keyboard cursor, and small saved pages.  pythreejs bundles three.js of 2018, and a page shows at
+most eight scenes.
 """
 
 from collections.abc import Mapping
@@ -49,10 +50,10 @@ __all__ = [
 ]
 LANDMARK = draw.OKABE_ITO[0]
 SCRIPTS = Path(__file__).parent / "scripts"
-WIDTH = 2048  # texels of a row of the table of modes: a power of two, so that places are exact
+WIDTH = 2048  # texels in a row of the table of modes: a power of two, so that indices are exact
 HUES = "compressed narrowed still widened expanded".split()
-HEIGHT = 4096  # rows that every graphics card takes
-LIGHTS = (  # what three.js fills in for a shader that is lit
+HEIGHT = 4096  # rows that every graphics card supports
+LIGHTS = (  # uniforms that three.js fills in for a lit shader
     "ambientLightColor directionalLights directionalShadowMap directionalShadowMatrix spotLights "
     "spotShadowMap spotShadowMatrix rectAreaLights ltc_1 ltc_2 pointLights pointShadowMap "
     "pointShadowMatrix hemisphereLights"
@@ -69,21 +70,21 @@ def surface(
     *,
     limits: tuple[float, float] | None = None,
 ) -> three.Mesh:
-    """A mesh Dataset as a smooth pythreejs surface, coloured by a field.
+    """Return a mesh Dataset as a smooth pythreejs surface, coloured by a field.
 
     Parameters
     ----------
     mesh : xarray.Dataset
         With ``position(vertex, xyz)`` and ``corner_vertex(triangle, corner)``.
     field : str or ndarray (vertex,) or (vertex, 3), optional
-        A value of each vertex, or the name of such a variable of the mesh: integers and booleans
-        are labels, with a colour each, other numbers go through the colour map, and three of them
-        are red, green and blue, from 0 to 1.  Where it is not finite the surface is grey.
+        A value of each vertex, or the name of such a variable of the mesh.  Integers and booleans
+        are labels with a colour each, other numbers are mapped by `cmap`, and three numbers are
+        red, green and blue from 0 to 1.  Vertices with non-finite values are grey.
     cmap : str or matplotlib.colors.Colormap, optional
-        By default red, white and blue for a field of both signs, "viridis" for one of one sign.
+        By default red, white and blue for a signed field, else "viridis".
     limits : (float, float), optional
-        Values of the two ends of the colour map; by default those of the field, without its
-        outermost percent, and as far below zero as above for a field of both signs.
+        Values at the ends of the colour map; by default the 1 % and 99 % quantiles of the field,
+        made symmetric for a signed field.
 
     Returns
     -------
@@ -92,7 +93,12 @@ def surface(
     Raises
     ------
     ValueError
-        When a position is not finite or the field has not one value for each vertex.
+        If a position is not finite, or the field does not have one value for each vertex.
+
+    See Also
+    --------
+    renderer : a scene of such surfaces.
+    s4a.show.charts.surfaces : still pictures.
 
     Examples
     --------
@@ -105,17 +111,17 @@ def surface(
     """
     require(mesh, "position", "corner_vertex", what="mesh")
     X, T = as_arrays(mesh)
-    wrong = (~np.isfinite(X)).any(1).sum()
-    if wrong:
+    n_wrong = (~np.isfinite(X)).any(1).sum()
+    if n_wrong:
         raise ValueError(
-            f"finite positions needed, found {wrong} vertices that are not; "
+            f"finite positions needed, found {n_wrong} vertices that are not; "
             "s4a.clean repairs the mesh"
         )
     return _body(X, T, None if field is None else _field_colors(mesh, field, cmap, limits))
 
 
 def _field_colors(mesh, field, cmap, limits):
-    """Colours (n, 3) of what was given as the field of a mesh."""
+    """Return colours (n, 3) of the `field` argument of a mesh."""
     if isinstance(field, str):
         if field not in mesh:
             raise ValueError(
@@ -139,7 +145,7 @@ def field_colors(
     cmap: str | Colormap | None = None,
     limits: tuple[float, float] | None = None,
 ) -> np.ndarray:
-    """Colours ``(n, 3)`` of numbers ``(n,)``; see :func:`surface`.
+    """Return colours ``(n, 3)`` of numbers ``(n,)``; see :func:`surface`.
 
     Examples
     --------
@@ -161,7 +167,7 @@ def field_colors(
 
 
 def _geometry(X, T, **attributes):
-    """A geometry of vertices, triangles and what else is of each vertex; None is left out."""
+    """Return a geometry with vertices, triangles and vertex attributes, except those of None."""
     known = {"position": X, "normal": vertex_normals(X, T)} | attributes
     arrays = {k: np.ascontiguousarray(v, np.float32) for k, v in known.items() if v is not None}
     index = np.asarray(T, np.uint32).ravel()
@@ -172,9 +178,9 @@ def _geometry(X, T, **attributes):
 
 
 def _body(X, T, colors=None, **options):
-    """A slightly rough surface, seen from both sides; in the vertices' colours or that of clay."""
-    look = {"color": to_hex(CLAY)} if colors is None else {"vertexColors": "VertexColors"}
-    material = three.MeshStandardMaterial(roughness=0.7, metalness=0.05, side="DoubleSide", **look)
+    """Return a two-sided matte surface in the vertices' colours, by default that of clay."""
+    color = {"color": to_hex(CLAY)} if colors is None else {"vertexColors": "VertexColors"}
+    material = three.MeshStandardMaterial(roughness=0.7, metalness=0.05, side="DoubleSide", **color)
     return three.Mesh(_geometry(X, T, color=colors), material, **options)
 
 
@@ -182,7 +188,7 @@ def _body(X, T, colors=None, **options):
 
 
 class Scores(anywidget.AnyWidget):
-    """Sliders of the scores of a mesh of :func:`modes`; the kernel hears when one is let go."""
+    """Sliders for the scores of :func:`modes`; the kernel gets a score when one is released."""
 
     _esm = SCRIPTS / "scores.js"
     _css = SCRIPTS / "scores.css"
@@ -190,14 +196,14 @@ class Scores(anywidget.AnyWidget):
 
 
 class ModesMesh(three.Mesh):
-    """A pythreejs mesh whose shader moves its vertices along modes; made by :func:`modes`.
+    """A pythreejs mesh deformed along modes of variation by a shader; made by :func:`modes`.
 
     Attributes
     ----------
     scores : list of float
-        In standard deviations, one for each mode; set them and the shape follows.
+        Score of each mode of variation, in standard deviations; the shape follows them.
     sliders : Scores
-        One for each mode; they move the shape without the kernel.
+        A slider for each mode; they deform the shape without the kernel.
     """
 
     scores = traitlets.List(traitlets.Float()).tag(sync=True)
@@ -207,7 +213,7 @@ class ModesMesh(three.Mesh):
         self.sliders = Scores(mesh=self)
 
     @traitlets.validate("scores")
-    def _one_for_each_mode(self, proposal):
+    def _check_scores(self, proposal):
         n = int(self.material.defines["MODES"])
         if len(proposal["value"]) != n:
             raise traitlets.TraitError(f"{n} scores needed, found {len(proposal['value'])}")
@@ -221,35 +227,39 @@ def modes(
     resolution: str = "full",
     colored: bool = True,
 ) -> ModesMesh:
-    """The mean shape of a study, which its scores deform in the browser (6.1).
+    """Return the mean shape of a study, deformed in the browser by its scores (6.1).
 
-    A shader adds up X + sum_k score_k mode_k: the modes are sent once, and a step of a slider is
-    no message to the kernel.  Normals follow the modes to first order.
+    A shader computes X + sum_k score_k mode_k.  The modes of variation are sent once, and sliders
+    need no message to the kernel.  Normals are exact to first order.
 
     Parameters
     ----------
     study : xarray.DataTree
         With ``/registration`` and ``/pca``.
     n_modes : int, optional
-        How many modes at most; None for all.
+        Largest number of modes of variation; None for all.
     resolution : {"full", "coarse"}
-        Which vertices of the template.
+        Resolution of the template.
     colored : bool
-        Whether the surface is coloured by its displacement along the mean's normals, blue where it
-        expands and red where it is compressed.
+        If True, colours show the displacement along the mean's normals: blue for expansion, red
+        for compression.
 
     Returns
     -------
     ModesMesh
-        A pythreejs Mesh with ``scores`` and, to be displayed beside its scene,
-        ``sliders``.  ``ipywidgets.jsdlink((panel.view, "scores"), (mesh, "scores"))`` lets it
-        follow a :class:`s4a.widgets.Modes` of as many modes, in the browser.  A pythreejs Picker
-        finds it where the mean is.
+        A pythreejs Mesh with ``scores``, and ``sliders`` to display with its scene.
+        ``ipywidgets.jsdlink((panel.view, "scores"), (mesh, "scores"))`` links it in the browser
+        to a :class:`s4a.widgets.Modes` with as many modes.  A pythreejs Picker picks points of
+        the mean shape.
 
     Raises
     ------
     ValueError
-        When the study has no modes, or there are too many numbers for a texture.
+        If the study has no modes of variation, or they do not fit into a texture.
+
+    See Also
+    --------
+    s4a.widgets.Modes : the panel.
 
     Examples
     --------
@@ -260,11 +270,11 @@ def modes(
     >>> view = threejs.renderer(mesh)  # in a notebook, display(view, mesh.sliders)
     """
     if not (has(study, "registration/position") and has(study, "pca/deformation")):
-        raise ValueError("a study with /registration and /pca needed, as of s4a.analyse")
+        raise ValueError("a study with /registration and /pca needed; run s4a.analyse")
     check_choice("resolution", resolution, ("full", "coarse"))
     coarse = template_coarse(study) if resolution == "coarse" else None
     if resolution == "coarse" and coarse is None:
-        raise ValueError("the study has no low resolution of its template; take the full one")
+        raise ValueError("the study has no low resolution of its template; use resolution='full'")
     mean, T, deformation = mode_arrays(study, coarse, n_modes)
     table, bends = mode_table(mean, T, deformation)
     limit, _ = mode_limits(study)
@@ -300,10 +310,10 @@ def modes(
 def mode_table(
     mean: np.ndarray, T: np.ndarray, deformation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The texture (rows, 2048, 4) of modes and of how they bend the normals, and of what size.
+    """Return a texture (rows, 2048, 4) of displacements and normal changes, and `bends` (c,).
 
-    The change of a normal is the derivative of their sum by the score, as a share of that sum's
-    length; 127 steps on each side of nothing, the last of which are `bends`.
+    The change of a normal is the derivative of the sum of triangle normals by the score, relative
+    to the length of that sum.  It is quantised in 127 steps of both signs up to `bends`.
     """
     c, n = deformation.shape[:2]
     rows = -(-n * c // WIDTH)
@@ -330,24 +340,24 @@ def mode_table(
 
 
 def points(
-    places: xr.Dataset | Mapping[str, np.ndarray] | np.ndarray,
+    positions: xr.Dataset | Mapping[str, np.ndarray] | np.ndarray,
     color: str = LANDMARK,
     *,
     radius: float | None = None,
     names: bool = True,
 ) -> three.Group:
-    """Landmarks as spheres, with their names.
+    """Return landmarks as spheres with their names.
 
     Parameters
     ----------
-    places : Dataset, dict of str to (3,), or ndarray (p, 3)
-        A Dataset with ``landmark_position(landmark, xyz)``, and ``landmark_name`` if they have any.
+    positions : Dataset, dict of str to (3,), or ndarray (p, 3)
+        A Dataset has ``landmark_position(landmark, xyz)`` and optionally ``landmark_name``.
     color : str
-        Of all, as matplotlib knows it.
+        Matplotlib colour of all spheres.
     radius : float, optional
-        In the unit of the places; by default a fiftieth of the diagonal of their box.
+        In the unit of the positions; by default 1/50 of the diagonal of their bounding box.
     names : bool
-        Whether the names stand beside the spheres.
+        If True, the names are shown next to the spheres.
 
     Returns
     -------
@@ -360,37 +370,37 @@ def points(
     ['nose', 'chin']
     """
     labels: list[str] = []
-    if isinstance(places, xr.Dataset):
-        require(places, "landmark_position", what="dataset")
-        if "landmark_name" in places:
-            labels = places["landmark_name"].values.astype(str).tolist()
-        places = places["landmark_position"].values
-    elif isinstance(places, Mapping):
-        labels, places = list(places), np.array(list(places.values()))
-    where = np.asarray(places, float)
-    labels = labels or [""] * len(where)
-    if where.ndim != 2 or where.shape[1] != 3 or not len(where) or not np.isfinite(where).all():
-        raise ValueError(f"finite points (p, 3) needed, found an array of shape {where.shape}")
-    size = radius or float(np.linalg.norm(np.ptp(where, axis=0))) / 50 or 1.0
+    if isinstance(positions, xr.Dataset):
+        require(positions, "landmark_position", what="dataset")
+        if "landmark_name" in positions:
+            labels = positions["landmark_name"].values.astype(str).tolist()
+        positions = positions["landmark_position"].values
+    elif isinstance(positions, Mapping):
+        labels, positions = list(positions), np.array(list(positions.values()))
+    X = np.asarray(positions, float)
+    labels = labels or [""] * len(X)
+    if X.ndim != 2 or X.shape[1] != 3 or not len(X) or not np.isfinite(X).all():
+        raise ValueError(f"finite points (p, 3) needed, found an array of shape {X.shape}")
+    size = radius or float(np.linalg.norm(np.ptp(X, axis=0))) / 50 or 1.0
     ball = three.SphereBufferGeometry(radius=size, widthSegments=20, heightSegments=14)
     material = three.MeshStandardMaterial(color=to_hex(color), roughness=0.5)
-    group, middle = three.Group(), where.mean(0)
-    for name, place in zip(labels, where, strict=True):
-        group.add(three.Mesh(ball, material, position=place.tolist(), name=name))
+    group, middle = three.Group(), X.mean(0)
+    for name, x in zip(labels, X, strict=True):
+        group.add(three.Mesh(ball, material, position=x.tolist(), name=name))
         if names and name:
-            outwards = (place - middle) / (np.linalg.norm(place - middle) or 1.0)
+            outwards = (x - middle) / (np.linalg.norm(x - middle) or 1.0)
             group.children[-1].add(_name(name, 3.5 * size * outwards, 2.4 * size))
     return group
 
 
-def _name(text, place, height, *, hidden=True):
-    """A text that always faces the viewer; where not `hidden`, nothing stands before it."""
+def _name(text, position, height, *, hidden=True):
+    """Return a text that faces the viewer; where not `hidden`, it is drawn over all surfaces."""
     letters = three.TextTexture(
         string=text, color="black", size=64, fontFace="monospace", squareTexture=False
     )
     material = three.SpriteMaterial(map=letters, transparent=True, depthTest=hidden)
     width = 0.6 * height * len(text)  # of a monospaced font
-    return three.Sprite(material, position=np.asarray(place).tolist(), scale=[width, height, 1])
+    return three.Sprite(material, position=np.asarray(position).tolist(), scale=[width, height, 1])
 
 
 def correspondence(
@@ -400,27 +410,31 @@ def correspondence(
     *,
     n_lines: int = 60,
 ) -> three.Group:
-    """Two surfaces side by side in matching colours, and lines between sampled matches.
+    """Return two surfaces side by side in matching colours, with lines between sampled matches.
 
     Parameters
     ----------
     pair : xarray.Dataset, xarray.DataTree or int ndarray (vertex,)
-        With ``match(vertex)``, as of :func:`s4a.match_pair`, or this match: on each vertex of the
-        target one of the source; or a study, whose latent basis matches two of its shapes (eq. 3).
+        Result of :func:`s4a.match_pair`, or its ``match(vertex)``: a vertex of the source for each
+        vertex of the target; or a study, whose latent basis matches two of its shapes (eq. 3).
     source, target : xarray.Dataset or str
         The meshes of the pair, or the names of two shapes of the study.
     n_lines : int
-        How many matches are drawn, spread over the target.
+        Number of matches that are drawn, farthest-point samples of the target.
 
     Returns
     -------
     pythreejs.Group
-        Its children are the source, the target, moved to the side, and the lines.
+        Its children are the source, the shifted target, and the lines.
 
     Raises
     ------
     ValueError
-        When the match is not one of these meshes.
+        If the match does not belong to these meshes.
+
+    See Also
+    --------
+    s4a.widgets.Correspondence : the panel.
 
     Examples
     --------
@@ -453,22 +467,22 @@ def correspondence(
     aside[0] += 0.65 * (np.ptp(X[:, 0]) + np.ptp(Y[:, 0]))
     Y = Y + aside
     colors = draw.position_colors(X)
-    here = farthest_points(Y, min(n_lines, len(Y)))
-    lines = _lines(X[match[here]], Y[here], colors[match[here]])
-    both = np.concatenate([X, Y])
+    sample = farthest_points(Y, min(n_lines, len(Y)))
+    segments = _segments(X[match[sample]], Y[sample], colors[match[sample]])
+    points = np.concatenate([X, Y])
     return three.Group(
-        # around the origin, where pythreejs first looks, whatever the target of its controls
-        position=(-(both.max(0) + both.min(0)) / 2).tolist(),
+        # around the origin, where pythreejs looks initially, whatever the target of its controls
+        position=(-(points.max(0) + points.min(0)) / 2).tolist(),
         children=[
             _body(X, S, colors),
             _body(Y, T, colors[match]),
-            lines,
+            segments,
         ],
     )
 
 
-def _lines(begin, end, colors, width=2):
-    """Segments from some points (p, 3) to others, each of one colour."""
+def _segments(begin, end, colors, width=2):
+    """Return line segments between points (p, 3), each of one colour."""
     geometry = three.LineSegmentsGeometry(
         positions=np.stack([begin, end], axis=1).astype(np.float32),
         colors=np.stack([colors, colors], axis=1).astype(np.float32),
@@ -478,26 +492,30 @@ def _lines(begin, end, colors, width=2):
 
 
 def network(study: xr.DataTree, *, names: bool = True) -> three.Group:
-    """Shapes at their places in the space of shape differences, joined by their maps (3.4, 3.5).
+    """Return the network of maps (3.4), with nodes placed by their shape differences (3.5).
 
     Parameters
     ----------
     study : xarray.DataTree
         With ``/coarse``, ``/network`` and ``/latent``.
     names : bool
-        Whether the shapes' names stand above them.
+        If True, the names are shown above the shapes.
 
     Returns
     -------
     pythreejs.Group
-        A surface for each shape, named after it, their names, and last the lines: each in the
-        colour of the mean cycle error of a pair's two maps, as in the panel
-        :class:`s4a.widgets.Network`.  Its ``bar`` is the colour bar, which :func:`renderer` shows.
+        A surface for each node, the names, and finally the edges, coloured by the mean cycle error
+        of the two maps of a pair as in the panel.  ``bar`` is the colour bar, which
+        :func:`renderer` shows.
 
     Raises
     ------
     ValueError
-        When the study has no network or no shape differences.
+        If the study has no network or no shape differences.
+
+    See Also
+    --------
+    s4a.widgets.Network : the panel.
 
     Examples
     --------
@@ -510,41 +528,41 @@ def network(study: xr.DataTree, *, names: bool = True) -> three.Group:
     needed = "network/cycle_error", "latent/area_score", "coarse"
     missing = [name for name in needed if not has(study, name)]
     if missing:
-        raise ValueError(f"a study with {', '.join(missing)} needed, as of s4a.analyse")
+        raise ValueError(f"a study with {', '.join(missing)} needed; run s4a.analyse")
     scores = study["latent"].dataset["area_score"]
     shapes = names_of(scores)
     surfaces = {name: study_surface(study, name) for name in shapes}
     size = max(np.ptp(X, axis=0).max() for X, _ in surfaces.values())
-    places = np.zeros((len(shapes), 3))
-    flat = scores.values[:, :3]
-    places[:, : flat.shape[1]] = flat
-    # a tenth of the pairs may lie nearer to each other than the shapes are long
-    places *= 1.3 * size / max(np.quantile(pdist(places), 0.1), np.finfo(float).tiny)
+    positions = np.zeros((len(shapes), 3))
+    known = scores.values[:, :3]
+    positions[:, : known.shape[1]] = known
+    # a tenth of the distances may be smaller than 1.3 times the extent of the shapes
+    positions *= 1.3 * size / max(np.quantile(pdist(positions), 0.1), np.finfo(float).tiny)
     group = three.Group()
-    for place, (name, (X, T)) in zip(places, surfaces.items(), strict=True):
+    for position, (name, (X, T)) in zip(positions, surfaces.items(), strict=True):
         centred = X - (X.max(0) + X.min(0)) / 2
-        body = _body(centred, T, position=place.tolist(), name=name)
+        body = _body(centred, T, position=position.tolist(), name=name)
         if names:
             body.add(_name(name, [0, 0, 0.7 * size], 0.15 * size, hidden=False))
         group.add(body)
-    net, limits = study["network"].dataset, network_limits(study)
-    of = [[shapes.index(name) for name in net[key].values] for key in ("source", "target")]
-    ends, pair = np.unique(np.sort(of, axis=0), axis=1, return_inverse=True)
-    error = net["cycle_error"].to_series().groupby(pair.ravel()).mean()
+    maps, limits = study["network"].dataset, network_limits(study)
+    shape_of = [[shapes.index(name) for name in maps[key].values] for key in ("source", "target")]
+    ends, pair = np.unique(np.sort(shape_of, axis=0), axis=1, return_inverse=True)
+    error = maps["cycle_error"].to_series().groupby(pair.ravel()).mean()
     colors = draw.cycle_error_colors(error.to_numpy(), limits)
-    group.add(_lines(places[ends[0]], places[ends[1]], colors, width=3))
+    group.add(_segments(positions[ends[0]], positions[ends[1]], colors, width=3))
     group.bar = color_scale(draw.CYCLE_ERROR, *limits, "cycle error (logarithmic)")
     return group
 
 
 def _color_bar(bar):
-    """A colour bar of width 1, as of :func:`s4a.show.browser.color_scale`, over all else."""
+    """Return a colour bar of width 1 (:func:`s4a.show.browser.color_scale`), drawn over all."""
     colors = np.array([to_rgb(color) for color in bar["colors"]])
-    places, shares = np.linspace(0, 1, len(colors)), np.linspace(0, 1, 256)
+    known, shares = np.linspace(0, 1, len(colors)), np.linspace(0, 1, 256)
     texels = np.full((1, 256, 4), 255, np.uint8)
-    texels[0, :, :3] = np.transpose([255 * np.interp(shares, places, c) for c in colors.T])
-    look = {"transparent": True, "depthTest": False}
-    strip = three.SpriteMaterial(map=three.DataTexture(texels), **look)
+    texels[0, :, :3] = np.transpose([255 * np.interp(shares, known, c) for c in colors.T])
+    texture = three.DataTexture(texels)
+    strip = three.SpriteMaterial(map=texture, transparent=True, depthTest=False)
     height = 0.045  # of the text
     group = three.Group(name="colour bar", children=[three.Sprite(strip, scale=[1, 0.04, 1])])
     for text, side in ((f"{bar['low']:.2g}", -1), (bar["label"], 0), (f"{bar['high']:.2g}", 1)):
@@ -564,17 +582,17 @@ def renderer(
     view: Viewpoint = "corner",
     up: str = "z",
 ) -> three.Renderer:
-    """A pythreejs renderer around objects, lit from the viewer, with controls to turn and zoom.
+    """Return a pythreejs renderer of objects, lit from the viewer, with controls of the camera.
 
     Parameters
     ----------
     *objects : pythreejs.Object3D
-        Of the functions of this module, or of your own; the camera is set to see all of them.  A
-        colour bar of theirs stands at the lower edge.
+        Objects made by this module or by other code; the camera sees all of them.  Their colour
+        bar is at the lower edge.
     size : (int, int)
         Width and height in pixels.
     view, up
-        From where they are seen first; see :func:`s4a.show.draw.rotation`.
+        Initial direction of view; see :func:`s4a.show.draw.rotation`.
 
     Returns
     -------
@@ -583,25 +601,25 @@ def renderer(
     """
     corners = np.concatenate([np.empty((0, 3)), *map(_corners, objects)])
     if not len(corners):
-        raise ValueError("a renderer needs at least one surface to look at")
+        raise ValueError("a renderer needs at least one object with vertices, found none")
     low, high = corners.min(0), corners.max(0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     aspect, fov = size[0] / size[1], 40
     half = np.deg2rad(fov) / 2
-    turn = draw.rotation(view, up)
-    # what is as deep as wide has room to turn; what is long fills the picture as it is seen first
+    R = draw.rotation(view, up)
+    # round objects have room to rotate; long ones fill the picture in the initial view
     around = 0.85 * radius / np.sin(min(half, np.arctan(aspect * np.tan(half))))
-    box = np.array([place for place in np.ndindex(3, 3, 3) if place != (1, 1, 1)]) - 1
+    box = np.array([corner for corner in np.ndindex(3, 3, 3) if corner != (1, 1, 1)]) - 1
     ellipsoid = box / np.linalg.norm(box, axis=1, keepdims=True)
-    nearest = []  # from where all of the ellipsoid in the box is seen, and all of the box
+    nearest = []  # distances from which the inscribed ellipsoid, and the whole box, are visible
     for points in (ellipsoid, box):
-        x, y, z = turn @ (points * (high - low) / 2).T
+        x, y, z = R @ (points * (high - low) / 2).T
         nearest.append(float((z + np.maximum(np.abs(x) / aspect, np.abs(y)) / np.tan(half)).max()))
     distance = min(max(around, 1.05 * nearest[0]), 1.05 * nearest[1])
     bars = [item.bar for item in objects if hasattr(item, "bar")]
-    distance *= 1.2 if bars else 1  # room for them below
+    distance *= 1.2 if bars else 1  # room for the bars below
     camera = three.PerspectiveCamera(
-        position=(middle + distance * turn[2]).tolist(),
+        position=(middle + distance * R[2]).tolist(),
         up=np.eye(3)["xyz".index(up)].tolist(),
         fov=fov,
         aspect=aspect,
@@ -610,12 +628,12 @@ def renderer(
         children=[three.DirectionalLight(position=[0, 0, 1], intensity=0.55)],
     )
     for bar in bars:
-        drawn, away = _color_bar(bar), radius / 20  # just before the camera, with which it moves
-        bottom = away * np.tan(half)
+        group, depth = _color_bar(bar), radius / 20  # near the camera, with which it moves
+        bottom = depth * np.tan(half)
         width = 1.2 * min(aspect, 2) * bottom
-        drawn.scale = [width] * 3
-        drawn.position = [0, 0.08 * width - bottom, -away]
-        camera.add(drawn)
+        group.scale = [width] * 3
+        group.position = [0, 0.08 * width - bottom, -depth]
+        camera.add(group)
     camera.lookAt(middle.tolist())
     controls = three.OrbitControls(controlling=camera, target=middle.tolist())
     scene = three.Scene(
@@ -628,7 +646,7 @@ def renderer(
 
 
 def _corners(item):
-    """The corners ``(p, 3)`` of the boxes of what is seen of an object and of what is in it."""
+    """Return the corners ``(p, 3)`` of the bounding boxes of an object and its children."""
     geometry, X = getattr(item, "geometry", None), np.empty((0, 3))
     if isinstance(geometry, three.BufferGeometry) and "position" in geometry.attributes:
         X = geometry.attributes["position"].array

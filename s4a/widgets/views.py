@@ -1,7 +1,7 @@
-"""What panels are made of: surfaces that turn, and charts; both can be clicked.
+"""Building blocks of panels: surfaces that can be rotated, and charts; both can be clicked.
 
-Arrays in, places and marks out.  Where the browser has no WebGL2 it says so, and is sent a still
-picture of the surface at every change.
+They take arrays and return the picked point or mark.  A browser without WebGL2 reports that, and
+gets a still picture of the surface at every change.
 """
 
 from typing import Any
@@ -32,11 +32,11 @@ from s4a.show.draw import (
 )
 
 SIZE = (460, 360)  # pixels of a still picture
-MARK = (0.9, 0.6, 0.0)  # the colour of a marked point
+MARK = (0.9, 0.6, 0.0)  # colour of a marked point
 
 
 def extent(points: np.ndarray) -> float:
-    """Length of the diagonal of the points' box.
+    """Return the diagonal of the bounding box.
 
     Examples
     --------
@@ -48,13 +48,13 @@ def extent(points: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
-def iteration_number(x: float) -> float:
-    """The next number below that is 1, 2 or 5 times a power of ten.
+def round_down(x: float) -> float:
+    """Return the largest number up to `x` that is 1, 2 or 5 times a power of ten.
 
     Examples
     --------
-    >>> from s4a.widgets.views import iteration_number
-    >>> iteration_number(17.3), iteration_number(0.6)
+    >>> from s4a.widgets.views import round_down
+    >>> round_down(17.3), round_down(0.6)
     (10.0, 0.5)
     """
     power = 10.0 ** np.floor(np.log10(x))
@@ -62,7 +62,7 @@ def iteration_number(x: float) -> float:
 
 
 def signed_limit(values: np.ndarray) -> float:
-    """The size at which the colours of a signed function ``(n,)`` are full: its 99 % quantile.
+    """Return the end of the colour scale of a signed function ``(n,)``: the 99 % quantile of |f|.
 
     Examples
     --------
@@ -75,46 +75,47 @@ def signed_limit(values: np.ndarray) -> float:
 
 
 def camera_group() -> str:
-    """A name that no other panel has: the views of one panel turn together, those of two do not."""
+    """Return a unique name: the views of one panel share it, and so rotate together."""
     return uuid4().hex
 
 
 class View(anywidget.AnyWidget):
-    """What views of surfaces share: from where they look, and pictures for want of WebGL2.
+    """Base class of views of surfaces: the camera, and still pictures without WebGL2.
 
     Attributes
     ----------
-    turn : list of float
-        Rows of the rotation with which the view first stands.
+    rotation : list of float
+        Rows of the initial rotation.
     group : str
-        Views of one group turn together.
+        Views of one group rotate together.
     webgl : {"", "yes", "no"}
-        Whether the browser has WebGL2; it says so once it draws.
+        Availability of WebGL2, which the browser reports once it draws.
     """
 
     _css = STYLE
     still = traitlets.Bytes().tag(sync=True)
     webgl = traitlets.Unicode("").tag(sync=True)
     group = traitlets.Unicode("").tag(sync=True)
-    turn = traitlets.List().tag(sync=True)
+    rotation = traitlets.List().tag(sync=True)
     height = traitlets.Int(360).tag(sync=True)  # pixels
 
     def drawn(self) -> tuple | None:
-        """Points, triangles and colours of what is seen, None for nothing."""
+        """Return points, triangles and colours of the visible surface; None if there is none."""
         raise NotImplementedError
 
     def picture(self) -> bytes:
-        """PNG bytes of what is seen from where the view first stands; empty for nothing."""
+        """Return a PNG of the surface in the initial view; empty if there is none."""
         drawn = self.drawn()
         if drawn is None:
             return b""
         points, triangles, colors = drawn
-        # the rotation is applied here, and the renderer then looks along z from the top
-        turned, look = points @ np.reshape(self.turn, (3, 3)).T, {"view": "top", "size": SIZE}
-        return image_bytes(on_white(render(turned, triangles, colors=colors, **look)), "png")
+        # the rotation is applied here; the renderer looks along z from the top
+        rotated = points @ np.reshape(self.rotation, (3, 3)).T
+        pixels = render(rotated, triangles, colors=colors, view="top", size=SIZE)
+        return image_bytes(on_white(pixels), "png")
 
     def draw_still(self, change: object = None) -> None:
-        """Send a still picture where the browser has no WebGL2."""
+        """Send a still picture if the browser has no WebGL2."""
         if self.webgl == "no":
             self.still = self.picture()
 
@@ -125,35 +126,35 @@ class Scene(View):
     Parameters
     ----------
     view, up
-        From where the surface is seen first; see :func:`s4a.show.draw.rotation`.
+        Initial direction of view; see :func:`s4a.show.draw.rotation`.
     **options
-        Of the traits, such as ``title``, ``group``, ``height`` and ``clickable``.
+        Values of the traits, such as ``title``, ``group``, ``height`` and ``clickable``.
 
     Attributes
     ----------
     clickable : bool
-        Whether places can be picked: by a click, or with a cursor that the arrow keys move over
+        If True, points can be picked: by a click, or with a cursor that the arrow keys move over
         the surface.
     picked, hovered : dict
-        The place that was clicked, or is under the pointer (where `hovering` is set): ``vertex``
-        (-1 beside the surface), ``face``, ``weights`` in that triangle, ``point``, and its number
-        `count`.  A place that the browser carries to the other view by itself is hovered unheard.
+        The clicked point, or the point under the pointer (if `hovering`): ``vertex`` (-1 outside
+        the surface), triangle ``face``, barycentric ``weights``, ``point``, and its number
+        `count`.  The kernel does not get points that the browser can mark on the other view itself.
     lasso : bool
-        Whether a drag draws around vertices, and does not turn the surface.
+        If True, a drag selects vertices instead of rotating the surface.
     drawn_around : dict
-        What was drawn: its ``polygon (q, 2)`` in the plane of the view, in the unit of the surface,
-        the rotation ``turn`` of that view, and its number `count`.
+        The lasso selection: its ``polygon (q, 2)`` in the plane of the view, in the unit of the
+        surface, the ``rotation`` of that view, and its number `count`.
     answer : int
-        The number of the place to which marks and caption answer; -1 for none.  An answer to a
-        place older than the last, of any view of the group, is not shown.
+        Number of the pick to which marks and caption belong; -1 for none.  If a later pick exists
+        in any view of the group, they are not shown.
     """
 
     _esm = SCENE
     position = traitlets.Bytes().tag(sync=True)
     corner = traitlets.Bytes().tag(sync=True)
     color = traitlets.Bytes().tag(sync=True)
-    coordinate = traitlets.Bytes().tag(sync=True)  # in which the checkerboard is evaluated
-    cell = traitlets.Float(0.0).tag(sync=True)  # its side
+    coordinate = traitlets.Bytes().tag(sync=True)  # where the checkerboard is evaluated
+    cell = traitlets.Float(0.0).tag(sync=True)  # side of its cubes
     ghost_position = traitlets.Bytes().tag(sync=True)
     ghost_corner = traitlets.Bytes().tag(sync=True)
     points = traitlets.List().tag(sync=True)  # [x, y, z, red, green, blue, radius] each
@@ -174,10 +175,10 @@ class Scene(View):
     lasso = traitlets.Bool(False).tag(sync=True)
     drawn_around = traitlets.Dict().tag(sync=True)
 
-    surface = colors = coordinates = None  # what is seen, as arrays
+    surface = colors = coordinates = None  # the traits as arrays
 
     def __init__(self, *, view="corner", up="z", **options):
-        super().__init__(turn=rotation(view, up).ravel().tolist(), **options)
+        super().__init__(rotation=rotation(view, up).ravel().tolist(), **options)
         self.observe(self.draw_still, ["webgl", "points"])
 
     def show(
@@ -187,7 +188,7 @@ class Scene(View):
         colors: np.ndarray | None = None,
         title: str | None = None,
     ) -> None:
-        """Show a surface ``(n, 3)``, ``(m, 3)`` with colours ``(n, 3)``; marks are forgotten."""
+        """Show a surface ``(n, 3)``, ``(m, 3)`` with colours ``(n, 3)``, and remove all marks."""
         self.surface = np.asarray(points), np.asarray(triangles)
         with self.hold_sync():
             self._send_colors(colors, None, 0.0)
@@ -207,17 +208,18 @@ class Scene(View):
         coordinates: np.ndarray | None = None,
         cell: float = 0.0,
     ) -> None:
-        """Colours of the vertices, and a checkerboard over them.
+        """Set the colours of the vertices, and optionally a checkerboard over them.
 
         Parameters
         ----------
         colors : float ndarray (n, 3)
-            None for none.
+            None for no colours.
         bar : dict, optional
-            The colour bar that explains them.
+            Colour bar, as :func:`s4a.show.browser.color_scale` returns it.
         coordinates : float ndarray (n, 3), optional
-            Where the checkerboard is evaluated; cubes of the side `cell` are bright and dark in
-            turn.
+            Points at which the checkerboard is evaluated.
+        cell : float
+            Side of its cubes, alternately bright and dark.
         """
         with self.hold_sync():
             self.bar = bar or {}
@@ -225,7 +227,7 @@ class Scene(View):
         self.draw_still()
 
     def paint_function(self, values: np.ndarray, label: str, limit: float | None = None) -> None:
-        """A signed function ``(n,)`` as colours, full at `limit` or :func:`signed_limit`."""
+        """Colour a signed function ``(n,)`` from -`limit` to `limit` (:func:`signed_limit`)."""
         limit = signed_limit(values) if limit is None else limit
         self.paint(signed_colors(values, limit), color_scale(SIGNED, -limit, limit, label))
 
@@ -239,17 +241,17 @@ class Scene(View):
     def mark(
         self, points: np.ndarray, colors: np.ndarray | tuple = (MARK,), radius: float | None = None
     ) -> None:
-        """Spheres around some points ``(p, 3)``, of one colour or one for each.
+        """Mark points ``(p, 3)`` by spheres of one colour, or of one colour each.
 
-        The radius, in the unit of the data, is by default a hundredth of the surface's extent.
+        The default radius is a hundredth of the surface's extent, in the unit of the data.
         """
         points = np.asarray(points, float).reshape(-1, 3)
         colors = np.broadcast_to(np.asarray(colors, float).reshape(-1, 3), points.shape)
         self.radius = self.radius if radius is None else float(radius)
-        places = np.concatenate([points, colors], axis=1).tolist()
+        marks = np.concatenate([points, colors], axis=1).tolist()
         with self.hold_sync():
             self.answer = -1
-            self.points = [[*place, self.radius] for place in places]
+            self.points = [[*mark, self.radius] for mark in marks]
 
     def connect(
         self,
@@ -260,23 +262,22 @@ class Scene(View):
         back: np.ndarray | None = None,
         color: tuple = (),
     ) -> None:
-        """Let the browser mark on the other view of the group what is picked on this one.
+        """Let the browser mark the match of a picked vertex on the other view of the group.
 
-        With `back` it compares this view with others of the same surface and the group: a vertex
-        that is picked is marked on all of them, and on the view of the other surface where each of
-        them has it, in its colour; one picked there is marked on each where it has that.
+        With `back`, several views show the same surface with the match of one method each.  A
+        vertex picked on one of them is marked on all, and its match by each method on the other
+        surface, in the colour of the method.  A vertex picked there is marked on each view.
 
         Parameters
         ----------
         link : int ndarray (n,)
-            A vertex of the other surface for each vertex, -1 for none.
+            Matched vertex of the other surface for each vertex, -1 for none.
         text : str
-            What is said of them, with ``{here}`` and ``{there}`` for the two, and ``{value}``.
+            Caption with ``{here}`` and ``{there}`` for the two vertices, and ``{value}``.
         values : float ndarray (n,), optional
-            The confidence, from 0 to 1; of views that are compared what is said in percent, NaN
-            where unknown.
+            The confidence from 0 to 1, or with `back` an error shown in percent; NaN if unknown.
         back : int ndarray (m,), optional
-            A vertex of this surface for each of the other, -1 for none.
+            Matched vertex of this surface for each vertex of the other, -1 for none.
         color : tuple of 3 floats
         """
         with self.hold_sync():
@@ -285,14 +286,16 @@ class Scene(View):
             self.link_back = b"" if back is None else to_bytes(back, "int32")
             self.link = to_bytes(link, "int32")
 
-    def over(self, points: np.ndarray | None = None, triangles: np.ndarray | None = None) -> None:
-        """A second surface that shines through, None for none."""
+    def overlay(
+        self, points: np.ndarray | None = None, triangles: np.ndarray | None = None
+    ) -> None:
+        """Show a second, translucent surface; None removes it."""
         with self.hold_sync():
             self.ghost_corner = b"" if triangles is None else to_bytes(triangles, "uint32")
             self.ghost_position = b"" if points is None else to_bytes(points, "float32")
 
     def drawn(self) -> tuple | None:
-        """The surface with its checkerboard and its marked points."""
+        """Return the surface with its checkerboard and marked points."""
         if self.surface is None:
             return None
         colors = self.colors
@@ -301,15 +304,15 @@ class Scene(View):
         return with_balls(*self.surface, colors, self.points)
 
 
-AXES = "eigenfunction of the source", "eigenfunction of the target"  # of columns, and of rows
+AXES = "eigenfunction of the source", "eigenfunction of the target"  # columns, rows
 DIRECTION = (
-    "C transfers functions from the source to the target: of their coefficients a on the source "
-    "(columns) it makes b = C a on the target (rows)."
+    "C transfers functions from source to target: it maps the coefficients a on the source "
+    "(columns) to b = C a on the target (rows)."
 )
 
 
 def plain(value: object) -> object:
-    """NumPy numbers and arrays as Python's own, NaN as None, so that they can be sent.
+    """Convert NumPy numbers and arrays to Python numbers and lists, and NaN to None.
 
     Examples
     --------
@@ -334,10 +337,10 @@ class Chart(anywidget.AnyWidget):
     spec : dict
         The ``kind`` of chart, its numbers and names.
     picked : dict
-        The mark that was clicked: an index, node, edge, or row and column, and its number `count`.
+        The clicked mark: an index, node, edge, or row and column, and its number `count`.
     answer : int
-        The number of the mark to which the chart answers as it is; -1 for none.  Answers to marks
-        older than the last are not drawn.
+        Number of the click that the chart answers; -1 for none.  If a later click exists, the
+        answer is not drawn.
     """
 
     _esm, _css = CHART, STYLE
@@ -348,13 +351,13 @@ class Chart(anywidget.AnyWidget):
     palette = traitlets.Bytes(palette(SIGNED)).tag(sync=True)
 
     def draw(self, kind: str, **spec: Any) -> None:
-        """Draw ``scatter``, ``bars``, ``lines`` or ``graph``: numbers as chart.js names them."""
+        """Draw ``scatter``, ``bars``, ``lines`` or ``graph``; chart.js has the keys of `spec`."""
         with self.hold_sync():
             self.answer = -1
             self.spec = plain({"kind": kind, **spec})
 
     def matrix(self, values: np.ndarray, limit: float = 1.0, **spec: Any) -> None:
-        """Draw a functional map ``(rows, columns)`` with signed colours from -limit to limit."""
+        """Draw a functional map ``(rows, columns)`` with colours from -`limit` to `limit`."""
         rows, columns = np.shape(values)
         with self.hold_sync():
             self.values = to_bytes(values, "float32")

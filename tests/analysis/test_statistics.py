@@ -375,7 +375,7 @@ def twelve():
         (np.array(["2020-01-01"] * 12, "M8[D]"), "found dates: give a date as a number"),
         (np.arange(12) * 1j, "found complex numbers"),
         (np.zeros((12, 2)), "one number for each shape"),
-        (["31", "?", *map(str, range(10))], "1 of its 12 cells are none .shape_01: '\\?'"),
+        (["31", "?", *map(str, range(10))], "1 of 12 cells are not .shape_01: '\\?'"),
     ],
 )
 def test_a_variable_of_no_use_is_refused_with_what_to_do(variable, words, twelve):
@@ -585,7 +585,7 @@ def test_a_regression_is_a_mode_that_page_panel_and_animation_show(simulated, tm
     panel.scores = [1.5]
     assert panel.vertices() == pytest.approx(later, abs=1e-5)
     panel.close()
-    assert "component 1" in write_page(moving, tmp_path / "page.html").read_text()
+    assert "mode 1" in write_page(moving, tmp_path / "page.html").read_text()
     path = write_film(moving, tmp_path / "age.gif", mode=None, n_frames=4, width=100)
     with Image.open(path) as picture:
         assert (picture.n_frames, picture.width) == (4, 100)

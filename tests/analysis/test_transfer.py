@@ -336,7 +336,7 @@ def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
     (tmp_path / "a.csv").write_text("p,q\n1,2\n")
     for name, n, text in (
         ("a.npy", 5, r"a.npy: 5 labels.* found an array of shape \(4,\)"),
-        ("half.npy", 2, "half.npy: labels need whole numbers or names, found 0.5"),
+        ("half.npy", 2, "half.npy: labels need integers or names, found 0.5"),
         (
             "two.npz",
             4,
@@ -389,7 +389,7 @@ def test_every_landmark_file_gives_the_same_points(tmp_path):
         ("name,x,y,z\n# picked by hand\na,1,2,3\n\nb,1,2\n", "line 5 needs 4 cells .* found 3"),
         ("name,x,y,z\na,1,2,3\nb,1,5,2,5,3,5\n", "line 3 needs 4 cells .* found 7: 'b, 1, 5"),
         ("a 1 2 3\nb 4\n", "line 2 needs 4 cells .* found 2"),
-        ("name;x;y;z\na;1,5;2;3\n", "line 2 needs a number where it has '1,5'"),
+        ("name;x;y;z\na;1,5;2;3\n", "line 2 needs a number, found '1,5'"),
         ("name,x,y,z,curve,closed\na,1,2,3\n", "line 2 needs 6 cells .* found 4"),
     ],
 )
@@ -409,7 +409,7 @@ def test_empty_cells_behind_a_row_and_comments_change_no_landmark(tmp_path):
     ("text", "said"),
     [
         ("vertex,label\n0,a\n1\n", "line 3 needs 2 cells .* found 1"),
-        ("vertex,label\n0,a\nb,a\n", "line 3 needs a number where it has 'b'"),
+        ("vertex,label\n0,a\nb,a\n", "line 3 needs a number, found 'b'"),
     ],
 )
 def test_an_invalid_row_of_labels_is_named_with_its_line(tmp_path, text, said):
@@ -439,7 +439,7 @@ def test_curves_of_slicer_and_of_tables_come_out_of_their_files_in_order(tmp_pat
     assert again.drop_attrs().identical(found.drop_attrs())
     (tmp_path / "one.csv").write_text("name,x,y,z,curve\na,1,2,3,boundary\n")
     with pytest.raises(
-        ValueError, match=r"one.csv .* a curve needs two points or more; 'boundary' has one"
+        ValueError, match=r"one.csv .* a curve needs at least two points; 'boundary' has one"
     ):
         read_landmarks(tmp_path / "one.csv")
 

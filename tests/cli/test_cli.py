@@ -106,7 +106,7 @@ def test_check_lists_every_shape_that_fits_and_ends_with_1_where_one_is_excluded
         (["check", "nowhere"], "nowhere"),
         (["view", "nowhere"], "not a study folder"),
         (["run", "nowhere", "--out", "study"], "nowhere"),
-        (["statistics", "nowhere", "--covariates", "age"], "give --group or --variable"),
+        (["statistics", "nowhere", "--covariates", "age"], "give --group or --regress-on"),
         (
             ["run", "nowhere", "--out", "study", "--k", "3"],
             "s4a: --k must be an integer of at least 4; found 3",

@@ -28,25 +28,25 @@ def other_modules(tmp_path, monkeypatch):
 def test_on_this_machine_nothing_is_lacking_and_nothing_is_left_behind(tmp_path, capsys):
     assert cli.main(["doctor", str(tmp_path)]) == 0
     said = capsys.readouterr().out
-    assert "0 lacking" in said
-    assert "lacks  " not in said
+    assert "0 missing" in said
+    assert "missing  " not in said
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_lacking_makes_the_exit_code_1(monkeypatch, capsys):
-    lacking = [Finding("a", "lacks", "broken", "mend a"), Finding("b", "note", "odd")]
+    lacking = [Finding("a", "missing", "broken", "mend a"), Finding("b", "note", "odd")]
     monkeypatch.setattr("s4a.cli.commands.examine", lambda folder: lacking)
     assert cli.main(["doctor"]) == 1
     said = capsys.readouterr().out
     assert "-> mend a" in said
-    assert said.endswith("1 lacking, 1 to know\n")
+    assert said.endswith("1 missing, 1 to know\n")
 
 
 @pytest.mark.parametrize(
     "source, told",
     [
         ("raise ImportError('libGL.so.1: no such file')\n", "libGL.so.1"),
-        ("class MeshSet:\n    def __init__(self, verbose): pass\n", "lacks its filters"),
+        ("class MeshSet:\n    def __init__(self, verbose): pass\n", "without its filters"),
         ("import os; os.abort()\n", "ends its process"),
     ],
 )
@@ -72,11 +72,11 @@ def test_a_package_that_is_missing_old_or_broken_is_named_with_what_to_type(
     needed = [("nosuchthing", "1.0"), ("numpy", "99.1"), ("libigl", "1.0"), ("scipy", "1.0")]
     monkeypatch.setattr(doctor, "needed", lambda extra="": needed)
     found = list(doctor.dependencies())
-    assert of(found, "nosuchthing").do == "pip install 'nosuchthing>=1.0'"
+    assert of(found, "nosuchthing").do == "pip install --upgrade 'nosuchthing>=1.0'"
     assert of(found, "numpy").do == "pip install --upgrade 'numpy>=99.1'"
     assert "wrong ELF class" in of(found, "igl").found
     assert of(found, "igl").do == "pip install --force-reinstall libigl"
-    assert {one.state for one in found} == {"lacks"}
+    assert {one.state for one in found} == {"missing"}
     assert len(found) == 3
 
 
@@ -89,9 +89,9 @@ def test_the_packages_are_those_of_the_project_and_none_of_its_extras():
 
 def test_a_folder_that_is_not_there_or_a_file_is_told(tmp_path):
     assert doctor.writable("study folder", tmp_path, "another").state == "ok"
-    assert doctor.writable("study folder", tmp_path / "none", "another").state == "lacks"
+    assert doctor.writable("study folder", tmp_path / "none", "another").state == "missing"
     (tmp_path / "file").touch()
-    assert doctor.writable("study folder", tmp_path / "file", "another").state == "lacks"
+    assert doctor.writable("study folder", tmp_path / "file", "another").state == "missing"
 
 
 def test_a_folder_without_leave_to_write_is_told(tmp_path):
@@ -99,7 +99,7 @@ def test_a_folder_without_leave_to_write_is_told(tmp_path):
     try:
         (tmp_path / "as root").touch()
     except PermissionError:
-        assert doctor.writable("study folder", tmp_path, "another").state == "lacks"
+        assert doctor.writable("study folder", tmp_path, "another").state == "missing"
     else:
         pytest.skip("root may write everywhere")
     finally:

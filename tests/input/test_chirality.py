@@ -1,4 +1,4 @@
-"""Left and right: who is mirrored by names, by a table, and by the shapes themselves."""
+"""Left and right: shapes are mirrored by name, by a table, or automatically."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,14 @@ from paths import DATA
 import s4a
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_normals, volume
 from s4a.input import plausibility
-from s4a.input.chirality import hands, in_file, mirror_image, mirrored_shapes, signs, to_reflect
+from s4a.input.chirality import (
+    in_file,
+    mean_chirality,
+    mirror_image,
+    mirrored_shapes,
+    signs,
+    to_reflect,
+)
 from s4a.input.clean import clean
 from s4a.input.subjects import subjects
 
@@ -16,13 +23,13 @@ NAMES = ["a", "b", "c"]
 
 
 @pytest.fixture(scope="module")
-def handed():
-    """Six shapes that clearly have a hand, the second and the fifth of the other."""
+def chiral():
+    """Six clearly chiral shapes, the second and the fifth mirrored."""
     shapes = {f"s{i}": clean(as_dataset(*faulty.shape(200 + i))) for i in range(6)}
     return shapes | {name: mirror_image(shapes[name]) for name in ("s1", "s4")}
 
 
-def test_a_mirror_image_is_that_with_its_normals_outward_and_its_mirror_the_shape_again():
+def test_a_mirror_image_has_outward_normals_and_mirroring_it_again_returns_the_shape():
     mesh = s4a.synthetic.ellipsoid(300).assign_attrs(reason="")
     mesh["landmark_position"] = ("landmark", "xyz"), [[1.0, 2, 3]]
     image = mirror_image(mesh)
@@ -40,44 +47,44 @@ def test_a_mirror_image_is_that_with_its_normals_outward_and_its_mirror_the_shap
 
 def test_signs_are_those_that_agree_with_most_pairs_whatever_their_order():
     rng = np.random.default_rng(0)
-    truth = np.where(np.arange(12) % 3 == 1, -1, 1)
-    likeness = np.outer(truth, truth) * rng.uniform(0.5, 2, (12, 12))
-    likeness[rng.random((12, 12)) < 0.4] = np.nan  # not held against each other
-    likeness[2, 5] = -4  # one pair is wrong
-    assert signs(likeness).tolist() == (truth * truth[0]).tolist()
+    true_sign = np.where(np.arange(12) % 3 == 1, -1, 1)
+    similarity = np.outer(true_sign, true_sign) * rng.uniform(0.5, 2, (12, 12))
+    similarity[rng.random((12, 12)) < 0.4] = np.nan  # not compared
+    similarity[2, 5] = -4  # one pair is wrong
+    assert signs(similarity).tolist() == (true_sign * true_sign[0]).tolist()
     order = rng.permutation(12)
-    turned = signs(likeness[np.ix_(order, order)])
-    assert turned.tolist() == (truth * truth[order[0]])[order].tolist()
+    permuted = signs(similarity[np.ix_(order, order)])
+    assert permuted.tolist() == (true_sign * true_sign[order[0]])[order].tolist()
 
 
-def test_the_shapes_of_the_rarer_hand_are_found_and_their_evidence_is_clear(handed):
-    seen = plausibility.examine(handed, intersections=False)
-    assert mirrored_shapes(seen) == (["s1", "s4"], [])
-    mean = dict(zip(seen, hands(seen), strict=True))
-    assert all(abs(one) > 0.8 for one in mean.values())
-    assert {name for name, one in mean.items() if one < 0} == {"s1", "s4"}
+def test_shapes_of_the_less_common_side_are_detected_with_clear_evidence(chiral):
+    comparisons = plausibility.examine(chiral, intersections=False)
+    assert mirrored_shapes(comparisons) == (["s1", "s4"], [])
+    mean = dict(zip(comparisons, mean_chirality(comparisons), strict=True))
+    assert all(abs(value) > 0.8 for value in mean.values())
+    assert {name for name, value in mean.items() if value < 0} == {"s1", "s4"}
 
 
-def test_of_as_many_left_as_right_those_stay_that_are_of_the_first_name(handed):
-    four = {name: handed[name] for name in ("s0", "s1", "s2", "s4")}
+def test_on_a_tie_the_side_of_the_first_name_stays(chiral):
+    four = {name: chiral[name] for name in ("s0", "s1", "s2", "s4")}
     assert mirrored_shapes(plausibility.examine(four, intersections=False)) == (["s1", "s4"], [])
 
 
-def test_shapes_that_are_their_own_mirror_image_are_left_and_that_is_said():
+def test_mirror_symmetric_shapes_are_left_as_they_are_with_a_remark():
     X, T = as_arrays(s4a.synthetic.sphere(400))
     alike = {f"e{i}": as_dataset(X * [10, 20 + i, 30], T) for i in range(4)}
     names, (remark,) = mirrored_shapes(plausibility.examine(alike, intersections=False))
     assert names == []
-    assert "mirrored none: the shapes are too like their own mirror images" in remark
+    assert "mirrored no shape: the shapes are too symmetric" in remark
 
 
-def test_a_shape_of_weak_evidence_is_named_and_stays(handed):
-    seen = plausibility.examine(handed, intersections=False)
-    weak = seen["s4"].assign(chirality=0.1 * seen["s4"]["chirality"])
-    names, (remark,) = mirrored_shapes(seen | {"s4": weak})
+def test_a_shape_with_weak_evidence_is_named_and_left_as_it_is(chiral):
+    comparisons = plausibility.examine(chiral, intersections=False)
+    weak = comparisons["s4"].assign(chirality=0.1 * comparisons["s4"]["chirality"])
+    names, (remark,) = mirrored_shapes(comparisons | {"s4": weak})
     assert names == ["s1"]
-    assert "cannot tell the hand of s4, which stayed as it is: look at it" in remark
-    assert mirrored_shapes({"s0": seen["s0"]})[0] == []
+    assert "cannot determine the side of s4, left as it is: look at it" in remark
+    assert mirrored_shapes({"s0": comparisons["s0"]})[0] == []
 
 
 @pytest.mark.parametrize(
@@ -91,12 +98,12 @@ def test_names_and_columns_choose(reflect, chosen):
 @pytest.mark.parametrize(
     "reflect, words",
     [
-        ("a,d", r"reflect names 'd', none of the shapes \(a, b, c\), and no column of the table"),
-        ("none", "mirrors none of the 3 shapes"),
+        ("a,d", r"'d' is not a shape \(a, b, c\) or a column of the table"),
+        ("none", "selects none of the 3 shapes"),
         ("side=x", "no shape has 'x' in the column 'side', which has l, r"),
-        ("hand=l", r"needs a table with the column 'hand'; it has side, gap, none"),
+        ("arm=l", r"needs a table with the column 'arm'; found side, gap, none"),
         ("gap=l", "the column 'gap' has no value for b"),
-        ("side", "needs a column of 1 and 0, or a value as side=l"),
+        ("side", "needs a column of 1 and 0, or a value, side=l"),
     ],
 )
 def test_what_cannot_be_mirrored_is_an_error_that_says_why(reflect, words):
@@ -105,22 +112,25 @@ def test_what_cannot_be_mirrored_is_an_error_that_says_why(reflect, words):
         to_reflect(reflect, NAMES, subjects(columns, NAMES))
 
 
-def test_all_fifteen_pairs_of_six_femurs_are_told_apart():
+def test_left_and_right_are_distinguished_in_all_pairs_of_six_femurs():
     files = sorted((DATA / "lower_limb_bones").glob("*femur*.npz"))
     if len(files) < 6:
-        pytest.skip("no femurs beside the repository")
+        pytest.skip("no femurs next to the repository")
     meshes = {}
     for file in files:
         with np.load(file) as arrays:
             meshes[file.stem] = clean(as_dataset(arrays["V"], arrays["F"]))
-    seen = {name: plausibility.describe(mesh, intersections=False) for name, mesh in meshes.items()}
-    is_left = {name: name.endswith("_l") for name in seen}
-    for name, one in seen.items():
-        beside = plausibility.compare(name, one, {n: seen[n] for n in seen if n != name})
-        for other in beside["reference"].values.tolist():
-            hand = beside["chirality"].sel(reference=other).item()
-            assert (hand > 0) == (is_left[name] == is_left[other])
-            assert abs(hand) > 1
+    descriptors = {
+        n: plausibility.describe(mesh, intersections=False) for n, mesh in meshes.items()
+    }
+    is_left = {name: name.endswith("_l") for name in descriptors}
+    for name, descriptor in descriptors.items():
+        references = {n: descriptors[n] for n in descriptors if n != name}
+        comparison = plausibility.compare(name, descriptor, references)
+        for other in references:
+            chirality = comparison["chirality"].sel(reference=other).item()
+            assert (chirality > 0) == (is_left[name] == is_left[other])
+            assert abs(chirality) > 1
     names, remarks = mirrored_shapes(plausibility.examine(meshes, intersections=False))
-    assert names == [name for name in seen if is_left[name]]
+    assert names == [name for name in descriptors if is_left[name]]
     assert remarks == []

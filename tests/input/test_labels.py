@@ -122,9 +122,9 @@ def test_a_volume_that_does_not_say_how_it_lies_is_named(tmp_path):
     [
         (np.full((4, 4, 4), 3, np.int16), 17, "label 17 expected, found 3"),
         (np.arange(64).reshape(4, 4, 4), 99, r"label 99 expected, found 1, 2, .*, 30 \.\.\."),
-        (np.zeros((4, 4, 4), np.uint8), 17, "every voxel is 0"),
-        (np.zeros((4, 4, 4), np.uint8), "all", "every voxel is 0"),
-        (np.full((4, 4, 4), 0.25, np.float32), 1, "whole numbers expected"),
+        (np.zeros((4, 4, 4), np.uint8), 17, "found 0 in every voxel"),
+        (np.zeros((4, 4, 4), np.uint8), "all", "found 0 in every voxel"),
+        (np.full((4, 4, 4), 0.25, np.float32), 1, "integers expected"),
         (
             np.ones((4, 4, 4, 2), np.uint8),
             1,
@@ -149,9 +149,9 @@ def test_damaged_volumes_are_refused(tmp_path):
     for damaged, why in (
         (data[:500], "bytes of voxels"),
         (huge, "27000000000000 bytes of voxels"),
-        (flat, "cannot be inverted"),
+        (flat, "an invertible affine map"),
         (b"OFF 3 1 0" * 100, "NIfTI or MGH expected"),
-        (gzip.compress(data)[:-200], "ends early|damaged|bytes of voxels"),
+        (gzip.compress(data)[:-200], "truncated|damaged|bytes of voxels"),
     ):
         path.write_bytes(bytes(damaged))
         with pytest.raises(ValueError, match=why):
@@ -280,7 +280,7 @@ def test_the_panel_of_a_run_counts_volumes(volumes, tmp_path):
 
     panel = Progress(volumes, tmp_path / "study", label=17, **OPTIONS)
     panel.process.join(120)
-    panel.look()
+    panel.update()
     assert panel.bars["read and clean"].max == 5
     panel.close()
     assert list(s4a.open_study(tmp_path / "study")["original"]) == [f"scan_{i}" for i in range(5)]

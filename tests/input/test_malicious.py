@@ -205,7 +205,7 @@ def test_offsets_of_polygons_whose_differences_overflow_are_refused(tmp_path):
         "a.vtk": legacy,
     }
     for name, content in files.items():
-        with pytest.raises(ValueError, match=rf"{name}.*polygons of 9 corners promised, found 9"):
+        with pytest.raises(ValueError, match=rf"{name}.*polygons of 9 corners expected, found 9"):
             read_mesh(file(tmp_path / name, content))
 
 
@@ -283,7 +283,7 @@ def test_a_compressed_file_that_is_cut_or_damaged_is_refused(tmp_path):
     packed = gzip.compress(
         WRITERS[".obj"](np.random.default_rng(0).random((50, 3)), T, {}), mtime=0
     )
-    with pytest.raises(ValueError, match="the gzip data ends early: found 40 bytes"):
+    with pytest.raises(ValueError, match="the gzip data is truncated: found 40 bytes"):
         read_mesh(file(tmp_path / "m.ply.gz", packed[:40]))
     with pytest.raises(ValueError, match="damaged gzip data"):
         read_mesh(file(tmp_path / "m.ply.gz", packed[:30] + b"\xff" * 30 + packed[60:]))

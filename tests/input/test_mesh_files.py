@@ -48,7 +48,7 @@ def test_scalars_are_written_where_the_format_holds_them(tmp_path):
     np.testing.assert_array_equal(nibabel.load(tmp_path / "m.gii").darrays[2].data, height)
     with np.load(tmp_path / "m.npz") as arrays:
         np.testing.assert_array_equal(arrays["height"], height)
-    with pytest.raises(ValueError, match=r"holds no values"):
+    with pytest.raises(ValueError, match=r"cannot hold values"):
         write_mesh(tmp_path / "m.stl", X, T, height=height)
     with pytest.raises(ValueError, match=r"each of 5 vertices"):
         write_mesh(tmp_path / "m.ply", X, T, height=height[:3])
@@ -175,7 +175,7 @@ def test_npz_is_read_by_any_of_its_keys(tmp_path, keys):
 def test_the_content_counts_and_not_the_name(tmp_path):
     attrs = same_surface(file(tmp_path, "m.stl", ply("binary_little_endian")))
     assert attrs["format"] == "PLY"
-    assert attrs["note"] == "named .stl but holds PLY, and was read as that; rename it"
+    assert attrs["note"] == "named .stl but read as PLY by its content; rename the file"
 
 
 def test_a_file_cut_anywhere_is_refused_with_its_name(tmp_path):
@@ -285,9 +285,9 @@ def test_different_files_never_share_a_name(tmp_path):
 
 
 def test_a_missing_path_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"no file, folder or match of .*absent"):
+    with pytest.raises(ValueError, match=r"no file or folder matches .*absent"):
         find_meshes(tmp_path / "absent")
-    with pytest.raises(ValueError, match=r"no match|no file, folder or match"):
+    with pytest.raises(ValueError, match=r"no match|no file or folder matches"):
         find_meshes(str(tmp_path / "*.ply"))
     with pytest.raises(ValueError, match=r"no mesh"):
         find_meshes(tmp_path)

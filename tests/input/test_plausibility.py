@@ -1,4 +1,4 @@
-"""What looks wrong with a shape beside its collection is told, and nothing else."""
+"""Suspect shapes of a collection are reported, without false positives."""
 
 import re
 import sys
@@ -25,20 +25,19 @@ def descriptor(X, T):
     return plausibility.describe(clean(as_dataset(X, T)), intersections=False)
 
 
-def doubts_of(descriptors, references=None):
+def flags_of(descriptors, references=None):
     """Name -> flags, and the remarks."""
-    chosen = {
-        name: descriptors[name] for name in references or plausibility.pick_references(descriptors)
-    }
-    seen = {name: plausibility.compare(name, one, chosen) for name, one in descriptors.items()}
-    attrs = {name: {"area": one.attrs["surface"]} for name, one in descriptors.items()}
-    return plausibility.find_warnings(attrs, seen)
+    names = references or plausibility.pick_references(descriptors)
+    chosen = {name: descriptors[name] for name in names}
+    compared = {n: plausibility.compare(n, data, chosen) for n, data in descriptors.items()}
+    attrs = {name: {"area": data.attrs["surface"]} for name, data in descriptors.items()}
+    return plausibility.find_warnings(attrs, compared)
 
 
-def told(descriptors):
+def kinds_of(descriptors):
     """Name -> kinds, flagged ones with an exclamation mark, and the remarks."""
-    found, remarks = doubts_of(descriptors)
-    kinds = {n: [one.kind + "!" * one.flagged for one in flags] for n, flags in found.items()}
+    all_flags, remarks = flags_of(descriptors)
+    kinds = {n: [flag.kind + "!" * flag.flagged for flag in all_flags[n]] for n in all_flags}
     return {name: words for name, words in kinds.items() if words}, remarks
 
 
@@ -46,84 +45,82 @@ def mirrored(X, T):
     return X * [-1, 1, 1], T[:, ::-1]
 
 
-def test_nothing_is_told_of_a_clean_collection(descriptors):
-    assert told(descriptors) == ({}, [])
+def test_a_clean_collection_has_no_flags_and_remarks(descriptors):
+    assert kinds_of(descriptors) == ({}, [])
 
 
 @pytest.mark.parametrize("kind", ["mirrored!", "unit!", "kind!", "partial!", "duplicate!"])
-def test_each_oddity_is_told_of_the_shape_that_has_it_and_of_no_other(descriptors, kind):
+def test_each_fault_is_reported_for_its_shape_only(descriptors, kind):
     X, T = SHAPES["s3"]
-    odd = {
+    fault = {
         "mirrored!": lambda: mirrored(X, T),
         "unit!": lambda: (X / 2.54, T),
         "kind!": lambda: (faulty.SPHERE[0] * [120, 25, 25], faulty.SPHERE[1]),
         "partial!": lambda: (X, T[(X[T, 2] < np.quantile(X[:, 2], 0.7)).all(axis=1)]),
         "duplicate!": lambda: (SHAPES["s1"][0][:, [1, 2, 0]] + 50, SHAPES["s1"][1]),
     }[kind]
-    assert told(descriptors | {"s3": descriptor(*odd())}) == ({"s3": [kind]}, [])
+    assert kinds_of(descriptors | {"s3": descriptor(*fault())}) == ({"s3": [kind]}, [])
 
 
-def test_of_a_symmetric_shape_a_copy_may_be_the_mirror_image_and_that_is_said(descriptors):
+def test_a_copy_of_a_symmetric_shape_is_reported_as_a_possible_mirror_image(descriptors):
     X, T = faulty.SPHERE
     pairs = {"s3": SHAPES["s1"], "e1": (X * [30, 40, 60], T), "e2": mirrored(X * [30, 40, 60], T)}
-    found, _ = doubts_of(descriptors | {name: descriptor(*mesh) for name, mesh in pairs.items()})
-    words = {n: one.words for n in found for one in found[n] if one.kind == "duplicate"}
+    flags, _ = flags_of(descriptors | {name: descriptor(*mesh) for name, mesh in pairs.items()})
+    words = {n: flag.words for n in flags for flag in flags[n] if flag.kind == "duplicate"}
     assert list(words) == ["s3", "e2"]
-    assert words["s3"].startswith("the same surface as s1, under two names; ")
-    assert words["e2"].startswith("the same surface as e1, under two names (or its mirror image)")
+    assert words["s3"].startswith("the same surface as s1; ")
+    assert words["e2"].startswith("the same surface as e1 (or its mirror image); ")
 
 
-def test_a_turned_shape_is_not_told_as_the_alignment_turns_it(descriptors):
+def test_a_rotated_shape_is_not_reported_as_it_is_aligned(descriptors):
     X, T = SHAPES["s3"]
-    assert told(descriptors | {"s3": descriptor(X * [1, -1, -1], T)}) == ({}, [])
+    assert kinds_of(descriptors | {"s3": descriptor(X * [1, -1, -1], T)}) == ({}, [])
 
 
-def test_of_half_a_collection_of_the_other_hand_the_half_without_the_first_name_is_told(
-    descriptors,
-):
-    odd = {name: descriptor(*mirrored(*SHAPES[name])) for name in ("s1", "s3", "s5", "s7")}
-    found, (remark,) = told(descriptors | odd)
-    assert found == {name: ["mirrored!"] for name in odd}
+def test_if_half_is_mirrored_the_half_without_the_first_name_is_reported(descriptors):
+    half = {name: descriptor(*mirrored(*SHAPES[name])) for name in ("s1", "s3", "s5", "s7")}
+    kinds, (remark,) = kinds_of(descriptors | half)
+    assert kinds == {name: ["mirrored!"] for name in half}
     assert remark.startswith("mirror images of each other, by ICP: s0, s2, s4, s6 and s1, s3")
 
 
-def test_the_residuals_of_a_mirror_image_are_those_beside_the_other_hand(descriptors):
-    odd = {name: descriptor(*mirrored(*SHAPES[name])) for name in ("s1", "s3", "s5", "s7")}
-    found, _ = doubts_of(descriptors | odd, ["s0", "s2", "s1", "s3", "s5"])
+def test_the_residuals_of_a_mirror_image_are_those_to_references_of_the_other_side(descriptors):
+    half = {name: descriptor(*mirrored(*SHAPES[name])) for name in ("s1", "s3", "s5", "s7")}
+    flags, _ = flags_of(descriptors | half, ["s0", "s2", "s1", "s3", "s5"])
     for name in ("s1", "s3", "s5"):
-        as_is, reflected = map(float, re.findall(r"0\.\d{3}", found[name][0].words))
+        as_is, reflected = map(float, re.findall(r"0\.\d{3}", flags[name][0].words))
         assert as_is > 2 * reflected
 
 
-def test_of_half_a_collection_in_another_unit_the_half_without_the_first_name_is_told(descriptors):
-    odd = {name: descriptor(SHAPES[name][0] * 10, SHAPES[name][1]) for name in ("s1", "s3", "s5")}
-    four = {name: one for name, one in descriptors.items() if name not in ("s6", "s7")}
-    found, (remark,) = told(four | odd)
-    assert found == {name: ["unit!"] for name in odd}
-    assert "times apart: s1, s3, s5, and the others" in remark
+def test_if_half_has_another_unit_the_half_without_the_first_name_is_reported(descriptors):
+    half = {name: descriptor(SHAPES[name][0] * 10, SHAPES[name][1]) for name in ("s1", "s3", "s5")}
+    six = {name: data for name, data in descriptors.items() if name not in ("s6", "s7")}
+    kinds, (remark,) = kinds_of(six | half)
+    assert kinds == {name: ["unit!"] for name in half}
+    assert "with the ratio 10: s1, s3, s5, and the others" in remark
 
 
-def test_of_few_shapes_only_what_needs_no_spread_is_told(descriptors):
+def test_few_shapes_are_reported_only_if_no_deviation_is_needed(descriptors):
     X, T = SHAPES["s2"]
     three = {name: descriptors[name] for name in ("s0", "s1", "s2")}
-    assert told(three | {"s2": descriptor(1000 * X, T)})[0] == {"s2": ["unit!"]}
-    assert told(three | {"s2": descriptor(*SHAPES["s0"])})[0] == {"s2": ["duplicate!"]}
-    assert told(three | {"s2": descriptor(X, T[(X[T, 2] < 0).all(axis=1)])})[0] == {}
+    assert kinds_of(three | {"s2": descriptor(1000 * X, T)})[0] == {"s2": ["unit!"]}
+    assert kinds_of(three | {"s2": descriptor(*SHAPES["s0"])})[0] == {"s2": ["duplicate!"]}
+    assert kinds_of(three | {"s2": descriptor(X, T[(X[T, 2] < 0).all(axis=1)])})[0] == {}
 
 
-def test_crossing_triangles_are_told_only_where_the_others_have_far_fewer(descriptors):
+def test_self_intersections_are_reported_only_if_the_others_have_far_fewer(descriptors):
     def with_shares(*shares):
-        seen = {
-            n: one.assign_attrs(intersecting=s, self_intersections=int(1000 * s))
-            for (n, one), s in zip(descriptors.items(), shares, strict=False)
+        crossing = {
+            n: data.assign_attrs(intersecting=s, self_intersections=int(1000 * s))
+            for (n, data), s in zip(descriptors.items(), shares, strict=False)
         }
-        return told(seen)[0]
+        return kinds_of(crossing)[0]
 
     assert with_shares(0.02, 0.01, 0.011, 0.004) == {}
     assert with_shares(0.02, 0.0, 0.001, 0.0) == {"s0": ["intersections"]}
 
 
-def test_a_registration_that_misses_and_distorts_is_told_where_neither_number_alone_is_odd():
+def test_a_registration_is_flagged_by_error_times_distortion_if_neither_alone_suffices():
     registration_error = {
         "template": 0.0,
         "good": 0.03,
@@ -140,8 +137,8 @@ def test_a_registration_that_misses_and_distorts_is_told_where_neither_number_al
         "stretched": 0.3,
         "fine": 0.1,
     }
-    found, _ = flagged(registration_error, distortion)
-    assert {n: [one.flagged for one in flags] for n, flags in found.items()} == {
+    flags, _ = flagged(registration_error, distortion)
+    assert {n: [flag.flagged for flag in flags[n]] for n in flags} == {
         "far": [True],
         "odd": [False],
     }

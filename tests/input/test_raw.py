@@ -28,7 +28,7 @@ IRREGULAR = {  # file -> what is said of it
     "pipe_arrays.npz": "found a named pipe",
     "zero.ply": "found a device",
     "socket.ply": "found a socket",
-    "broken.ply": "found a link to nowhere.ply, which is not there",
+    "broken.ply": "found a broken link to nowhere.ply",
     "loop.ply": "cannot be opened or read: Too many levels of symbolic links",
     "sparse.ply": "a file of at most 2 GiB expected, found a larger one",
 }

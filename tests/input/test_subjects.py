@@ -86,8 +86,8 @@ def test_a_column_that_is_mostly_numbers_is_named_with_its_cells(tmp_path, caplo
     file.write_text("shape;age;size;code\na;31;60,5;1a\nb;?;61,0;2a\nc;40;62,5;3\n")
     found = read_table(file, list("abc"))
     assert [found[name].dtype.kind for name in ("age", "size", "code")] == ["U"] * 3
-    assert "'age' is mostly numbers, but 1 of its 3 cells are none (b: '?')" in caplog.text
-    assert "'size' is mostly numbers, but 3 of its 3 cells are none (a: '60,5'" in caplog.text
+    assert "'age' is mostly numbers, but 1 of 3 cells are not (b: '?')" in caplog.text
+    assert "'size' is mostly numbers, but 3 of 3 cells are not (a: '60,5'" in caplog.text
     assert "'code'" not in caplog.text
 
 
@@ -95,7 +95,7 @@ def test_a_person_of_several_shapes_is_named(tmp_path, caplog):
     file = tmp_path / "table.csv"
     file.write_text("shape,subject,age\na,p1,31\nb,p1,32\nc,p2,NA\n")
     read_table(file, list("abc"))
-    assert "1 values of the column 'subject' stand for several shapes (p1: a, b)" in caplog.text
+    assert "1 values of the column 'subject' have several shapes (p1: a, b)" in caplog.text
 
 
 def test_rows_without_a_shape_are_ignored_and_shapes_without_a_row_lack_values(tmp_path, caplog):
@@ -124,10 +124,10 @@ def test_statistics_leave_out_a_shape_that_has_no_row_in_the_table(caplog):
         ("name,age\na,1\n", "a column 'shape' .* needed; found \\['name', 'age'\\]"),
         ("shape,age\nc,1\nA,2\n", r"names of the shapes \(a, b\) needed .* found c, A"),
         ("shape,age\na,1\nb,2\na,3\n", "found two for 'a'"),
-        ("shape,age\n# b is odd\n\na,1\nb\n", "2 cells in every row needed; line 5 has 1"),
+        ("shape,age\n# b is odd\n\na,1\nb\n", "2 cells in every row needed; found 1 in line 5"),
         ("shape,a/b\na,1\nb,2\n", "without '/'; found 'a/b'"),
         ("shape,age,age\na,1,2\nb,1,2\n", "found 'age'"),
-        ("shape\na\nb\n", "a column beside 'shape' needed"),
+        ("shape\na\nb\n", "a column in addition to 'shape' needed"),
         (
             "shape,age\na,1\nb,1e999\n",
             "finite numbers, or nothing, needed in the column 'age'; found inf",
@@ -236,7 +236,7 @@ def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch)
         str(folder / "study"),
         "--group",
         "sex",
-        "--variable",
+        "--regress-on",
         "age",
         "--permutations",
         "19",
@@ -274,7 +274,7 @@ def test_the_command_refuses_what_makes_no_test_and_says_a_warning_once(folder, 
     flags = ["--group", "sex", "--covariates", "score", "--permutations", "9"]
     assert cli.main([*command, *flags, "--variances", "unequal"]) == 0
     assert caplog.text.count("groups under 10 shapes (f: 3, m: 3)") == 1
-    assert "accounted for: covariate 'score'" in capsys.readouterr().out
+    assert "covariates: covariate 'score'" in capsys.readouterr().out
 
 
 def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
@@ -317,7 +317,7 @@ def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
             "shape,age\nà,1\n".encode("latin-1"),
             "byte 0xe0 in line 2: .* Latin-1 .* 'à'",
         ),
-        (b"shape,age\na,1\0\n", "the byte 0 in line 2: it seems to be a binary or a damaged file"),
+        (b"shape,age\na,1\0\n", "the byte 0 in line 2: the file seems to be binary or damaged"),
         (b"PK\x03\x04\x14\0", "found a workbook or an archive: export it as CSV UTF-8"),
         (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "found a workbook or an archive"),
         (b"", "the file is empty"),

@@ -6,7 +6,7 @@ from paths import DOCS, LESSONS, NOTEBOOKS, ROOT, TESTS
 
 HEADING = "## Words that S4A does not use"
 CODE = ("s4a", "morphometrics", "tests", "benchmarks", "tools", "binder")
-PAGES = [*DOCS.glob("*.md"), *DOCS.glob("*/*.md"), *LESSONS, NOTEBOOKS / "README.md"]
+PAGES = [*DOCS.glob("[!_]*.md"), *DOCS.glob("*/*.md"), *LESSONS, NOTEBOOKS / "README.md"]
 PAGES += [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 
 

@@ -355,7 +355,7 @@ def test_a_folder_that_vanishes_ends_a_run_until_it_is_read_and_is_not_missed_in
     analyse(meshes, **options).close()
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert_equal_but_paths(folder, whole)
-    with pytest.raises(ValueError, match=r"no file, folder or match of .*meshes"):
+    with pytest.raises(ValueError, match=r"no file or folder matches .*meshes"):
         analyse(meshes, **options)
     assert_equal_but_paths(folder, whole)
 

@@ -143,7 +143,7 @@ def test_a_folder_of_landmarks_is_read_by_the_names_of_shapes(tmp_path):
         "Knie_3": "Knie 3.csv",
     }
     (tmp_path / "head.csv").write_text("")
-    with pytest.raises(ValueError, match=r"landmarks: one file for head needed: .*head\.csv"):
+    with pytest.raises(ValueError, match=r"landmarks: one file for head needed; found .*head\.csv"):
         files_named(tmp_path, ["head"], "landmarks", SUFFIXES)
     with pytest.raises(
         ValueError, match=r"named as a shape, such as foot with one of .*\.mrk\.json"

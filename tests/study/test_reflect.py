@@ -131,7 +131,7 @@ def test_a_new_shape_of_the_other_hand_is_told_where_nothing_is_asked(newcomer, 
 def test_a_hand_that_cannot_be_told_is_said_and_an_unknown_name_is_an_error(
     newcomer, folder, study, meshes, caplog
 ):
-    with pytest.raises(ValueError, match=r"reflect names 's8', none of the new shapes \(s9\)"):
+    with pytest.raises(ValueError, match=r"'s8' is not a new shape \(s9\)"):
         s4a.insert(open_study(folder), {"s9": newcomer[0]}, reflect="s8", n_jobs=1)
     brain = meshes["brain_02"]
     found = s4a.insert(study, {"again": brain}, reflect="auto", n_jobs=1)
@@ -145,6 +145,6 @@ def test_the_command_of_new_shapes_mirrors_them_too(newcomer, folder, tmp_path, 
     s4a.write_mesh(tmp_path / "s9.ply", *newcomer[1])
     command = ["insert", str(folder), str(tmp_path / "s9.ply"), "--out", str(tmp_path / "out")]
     assert cli.main([*command, "--reflect", "auto", "--n-jobs", "1"]) == 0
-    assert "left for right" not in capsys.readouterr().out
+    assert "mirror image" not in capsys.readouterr().out
     assert cli.main([*command, "--reflect", "s1", "--n-jobs", "1"]) == 2
-    assert "reflect names 's1', none of the new shapes (s9)" in capsys.readouterr().err
+    assert "'s1' is not a new shape (s9)" in capsys.readouterr().err

@@ -385,7 +385,7 @@ def beyond(name):
 
 
 CHANGES = [
-    ("original/brain_01", without("position"), "it lacks position"),
+    ("original/brain_01", without("position"), "missing variables position"),
     ("original/brain_01", beyond("corner_vertex"), "corner_vertex needs indices 0..1499 of vertex"),
     ("original/brain_01", as_text("position"), "position needs numbers"),
     ("original/brain_01", lambda d: d.rename(xyz="abc"), "position needs the dims"),
@@ -393,21 +393,21 @@ CHANGES = [
     ("original/brain_01", lambda d: d.drop_attrs(), "the attribute status needs a text"),
     ("coarse/brain_01", beyond("coarse_vertex"), "coarse_vertex needs indices"),
     ("coarse/brain_01", beyond("sample_vertex"), "sample_vertex needs indices"),
-    ("coarse/brain_01", without("eigenvalue"), "it lacks eigenvalue"),
+    ("coarse/brain_01", without("eigenvalue"), "missing variables eigenvalue"),
     ("coarse/brain_01", lambda d: d.isel(original_vertex=slice(900)), "needs indices|needs 1500"),
-    ("latent", without("latent_basis"), "it lacks latent_basis"),
-    ("latent", without("shape"), "it lacks shape"),
-    ("latent", lambda d: d.assign_coords(shape=["brain_01"] * 4), "names that differ"),
+    ("latent", without("latent_basis"), "missing variables latent_basis"),
+    ("latent", without("shape"), "missing variables shape"),
+    ("latent", lambda d: d.assign_coords(shape=["brain_01"] * 4), "unique names"),
     ("registration", lambda d: d.drop_attrs(), "the attribute template needs a text"),
     ("registration", lambda d: d.isel(triangle=slice(9)), "triangle needs"),
     ("registration/brain_01", beyond("registered_match"), "registered_match needs indices"),
     ("registration/brain_01", beyond("template_triangle"), "template_triangle needs indices"),
     ("registration/brain_01", lambda d: d.isel(vertex=slice(9)), "vertex needs"),
     ("registration/brain_01", lambda d: d.assign_attrs(score="?"), "score needs a number"),
-    ("pca", without("score"), "it lacks score"),
+    ("pca", without("score"), "missing variables score"),
     ("pca", lambda d: d.isel(vertex=slice(9)), "vertex needs"),
-    ("report", without("status"), "it lacks status"),
-    ("report", lambda d: d.isel(shape=[0, 0, 1, 2]), "names that differ"),
+    ("report", without("status"), "missing variables status"),
+    ("report", lambda d: d.isel(shape=[0, 0, 1, 2]), "unique names"),
 ]
 
 

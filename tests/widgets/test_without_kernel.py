@@ -58,11 +58,11 @@ FRAMED = """<div class="s4a-panel"><div id="at"></div></div><script type="module
 %s
 const state = { title: "Panel", help: {}, font: 0 }, heard = [];
 window.state = state;
-window.answer = () => { state.heard = state.asked; heard.forEach((act) => act()); };
+window.answer = () => { state.pong = state.ping; heard.forEach((act) => act()); };
 widget.render({ el: document.getElementById("at"), model: {
   widget_manager: %s, saved: %s,
   get: (name) => state[name], set: (name, value) => { state[name] = value; },
-  on: (event, act) => event === "change:heard" && heard.push(act), off: () => {},
+  on: (event, act) => event === "change:pong" && heard.push(act), off: () => {},
   save_changes: () => {},
 } });
 window.ready = true;
@@ -109,13 +109,13 @@ def test_a_saved_page_asks_for_no_kernel(framed):
     page = framed(saved="true")
     page.clock.run_for(60_000)
     assert page.get_by_role("status").count() == 0
-    assert page.evaluate("state.asked") is None
+    assert page.evaluate("state.ping") is None
 
 
 def test_python_answers_what_it_is_asked(study):
     panel = widgets.Median(study)
-    panel.frame.asked = 17.0
-    assert panel.frame.heard == 17.0
+    panel.frame.ping = 17.0
+    assert panel.frame.pong == 17.0
     panel.close()
 
 
@@ -126,9 +126,9 @@ def test_a_click_on_what_a_saved_page_did_not_keep_says_so(browser, study, tmp_p
     page = browser.new_page()
     page.goto(path.as_uri())
     page.wait_for_selector("canvas.s4a-view")
-    said = page.locator("#not-kept")
-    assert said.inner_text() == ""
+    texts = page.locator("#not-recorded")
+    assert texts.inner_text() == ""
     other = next(name for name in study["coarse"].children if name != panel.shape.value)
     page.locator(f"rect.s4a-mark[aria-label^='{other}:']").dispatch_event("click")
-    assert said.inner_text().startswith(f"{other} is not kept in this page")
+    assert texts.inner_text().startswith(f"{other} is not recorded in this page")
     page.close()

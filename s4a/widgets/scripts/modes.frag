@@ -1,4 +1,4 @@
-// The light of the scene on a surface coloured by its displacement along the mean's normals.
+// Lighting of a surface coloured by its displacement along the mean's normals.
 #define PHONG
 uniform vec3 diffuse;
 uniform vec3 emissive;
@@ -18,10 +18,10 @@ varying float vAlong;
 #include <lights_phong_pars_fragment>
 
 vec3 hue(float share) {
-  float far = 2.0 * clamp(abs(share), 0.0, 1.0);
-  vec3 half_way = share < 0.0 ? narrowed : widened;
+  float t = 2.0 * clamp(abs(share), 0.0, 1.0);
+  vec3 middle = share < 0.0 ? narrowed : widened;
   vec3 full = share < 0.0 ? compressed : expanded;
-  return far < 1.0 ? mix(still, half_way, far) : mix(half_way, full, far - 1.0);
+  return t < 1.0 ? mix(still, middle, t) : mix(middle, full, t - 1.0);
 }
 
 void main() {

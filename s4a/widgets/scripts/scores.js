@@ -1,5 +1,5 @@
-// The scores of a pythreejs mesh: into the uniforms of its shader, and as sliders.
-// Nothing here waits for the kernel: it hears of a slider once, when that is let go.
+// Scores of a pythreejs mesh: written to the uniforms of its shader, and shown as sliders.
+// Nothing waits for the kernel, which gets a score when its slider is released.
 
 async function meshOf(model) {
   const id = model.get("mesh").replace("IPY_MODEL_", "");
@@ -15,7 +15,7 @@ async function initialize({ model }) {
     if (uniforms?.scores) uniforms.scores.value = [...mesh.get("scores")];
   };
   apply();
-  mesh.on("change:scores", apply); // the scenes of the mesh draw themselves anew after it
+  mesh.on("change:scores", apply); // the scenes of the mesh redraw afterwards
   mesh.trigger("childchange", mesh);
   return () => mesh.off("change:scores", apply);
 }
@@ -31,11 +31,11 @@ async function render({ model, el }) {
     Object.assign(input, { min: -3, max: 3, step: 0.05 });
     const output = document.createElement("output");
     label.append(`mode ${mode + 1}`, input, output);
-    input.title = "in standard deviations; a double click puts it back to the mean";
+    input.title = "in standard deviations; a double click resets it to the mean";
     const move = (value) => {
       const scores = [...mesh.get("scores")];
       scores[mode] = value;
-      mesh.set({ scores }, "pushFromThree"); // what pythreejs sends no message for
+      mesh.set({ scores }, "pushFromThree"); // pythreejs sends no message for it
     };
     input.addEventListener("input", () => move(Number(input.value)));
     input.addEventListener("change", () => mesh.save_changes());
@@ -43,7 +43,7 @@ async function render({ model, el }) {
       move(0);
       mesh.save_changes();
     });
-    input.addEventListener("keydown", (event) => event.stopPropagation()); // not the notebook's
+    input.addEventListener("keydown", (event) => event.stopPropagation()); // not for the notebook
     return [input, output];
   });
   const show = () => {
