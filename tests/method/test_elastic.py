@@ -117,8 +117,8 @@ def test_nearest_points_are_on_the_surface_and_not_farther_than_nearest_vertices
     assert distance_to_surface(points, shape.full.X, shape.full.T).max() < 1e-9
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1)
     vertex = spectral_icp.nearest_vertices(shape.full, template.low.moved_to(X))
-    surface_distance = np.linalg.norm(points - X, axis=1).mean()
-    assert surface_distance < 0.9 * np.linalg.norm(shape.full.X[vertex] - X, axis=1).mean()
+    distance = np.linalg.norm(points - X, axis=1).mean()
+    assert distance < 0.9 * np.linalg.norm(shape.full.X[vertex] - X, axis=1).mean()
 
 
 @pytest.fixture(scope="module")

@@ -55,13 +55,13 @@ def test_every_shape_is_in_a_triangle_with_twice_as_many_pairs_as_shapes(n):
 
 
 def chosen_by_definition(distance, n_pairs):
-    """The pairs one by one, as :func:`network.choose_pairs` says in words."""
+    """Choose the pairs one by one by the definition in :func:`network.choose_pairs`."""
     n = len(distance)
     inside, edges, closing = [int(np.argmin(distance.sum(1)))], [], []
     while len(inside) < n:
-        edges = [(distance[i, j], j, i) for j in range(n) if j not in inside for i in inside]
-        least = min(edges)[0]
-        new = min(j for d, j, _ in edges if d == least)
+        options = [(distance[i, j], j, i) for j in range(n) if j not in inside for i in inside]
+        least = min(options)[0]
+        new = min(j for d, j, _ in options if d == least)
         parent = next(i for i in inside if distance[i, new] == least)
         around = sorted({j for edge in edges for j in edge if parent in edge} - {parent})
         if around:
