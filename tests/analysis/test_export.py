@@ -1,4 +1,4 @@
-"""Registered output and training sets: what is written is what the study holds."""
+"""Registered output and training sets: files equal the arrays of the study."""
 
 import csv
 import json

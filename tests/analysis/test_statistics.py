@@ -1,6 +1,6 @@
 """Statistics (6.1): closed forms of a one-mode family, simulated groups.
 
-And p values under no difference.
+And p values under the null hypothesis.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Transfer (6.2): labels, landmarks and fields on known correspondences, the files, the command.
+"""Transfer (6.2): labels, landmarks and fields with known correspondences, files, command.
 
 Real templates.
 """
@@ -69,7 +69,7 @@ def study(meshes):
 
 @pytest.fixture(scope="module")
 def moved(meshes):
-    """The first brain with its vertices in another order, turned and shifted; and the order."""
+    """The first brain with its vertices in another order, rotated and shifted; and the order."""
     X, T = as_arrays(meshes["brain_01"])
     order = np.random.default_rng(0).permutation(len(X))
     R = Rotation.from_euler("zyx", [20, 10, -15], degrees=True).as_matrix()

@@ -1,6 +1,6 @@
-"""What each term of a score, each stop and each threshold of the method decides.
+"""Effect of each term of a score, each stopping criterion and each threshold of the method.
 
-Most of these were chosen by measurement; a test of a whole study would pass without one of them.
+Most values were tuned by measurement; tests of a whole study pass without any one of them.
 """
 
 from dataclasses import replace
@@ -18,7 +18,7 @@ from s4a.method.shape import Basis, Shape
 
 
 def basis(X, T, **more):
-    """A surface with one constant function, its area made one."""
+    """A surface of unit area with one constant function."""
     area = vertex_areas(X, T)
     return Basis(X / np.sqrt(area.sum()), T, area / area.sum(), np.ones((len(X), 1)), **more)
 
@@ -30,7 +30,7 @@ def sphere():
 
 
 def hemisphere(whole):
-    """The upper half of a surface, as it lies, and the vertex of the whole at each of its own."""
+    """Return the upper half of a surface, and the index of each of its vertices in the whole."""
     upper = np.flatnonzero(whole.X[:, 2] > 0)
     row = np.full(len(whole.X), -1)
     row[upper] = np.arange(len(upper))
@@ -46,7 +46,7 @@ def hemisphere(whole):
 
 
 def far(X, Y):
-    """Of each of the points X, the distance of the nearest of Y."""
+    """Return the distance from each point of X to the nearest point of Y."""
     return np.linalg.norm(X[:, None] - Y[None], axis=2).min(axis=1)
 
 
@@ -122,7 +122,7 @@ def surface():
 
 
 def ends(surface, X, **changed):
-    """Where the vertices of a surface end on the same surface moved to X."""
+    """Return the registered vertices of a surface on the same surface moved to X."""
     begin = np.eye(3), np.zeros(3), np.zeros((1, 3))
     schedule = elastic.DEFORMATION._replace(**changed)
     return spectral_icp.move(

@@ -26,7 +26,7 @@ from s4a.study.pair import shape_of
 
 @pytest.fixture(scope="module")
 def pair():
-    """A template, a shape of other vertices, and where the former's vertices are on the latter."""
+    """A template, a shape with other vertices, and the true image of the template's vertices."""
     tree = synthetic.brains(2, 3000, seed=5)
     options = Options(n_coarse=1500, k=60)
     template, shape = (

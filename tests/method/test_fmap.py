@@ -23,7 +23,7 @@ def shape(low_brain):
 
 @pytest.fixture(scope="module")
 def permuted(shape):
-    """The same shape with its vertices renumbered and some signs turned.
+    """The same shape with its vertices renumbered and some signs flipped.
 
     And the match from it to the shape.
     """
@@ -35,7 +35,7 @@ def permuted(shape):
 
 
 def basis(Phi, area, eigenvalue=None):
-    """Functions alone: the steps of this file ask for no surface."""
+    """Functions alone: these tests need no surface."""
     return Basis(None, None, area, Phi, eigenvalue)
 
 

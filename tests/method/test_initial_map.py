@@ -1,6 +1,6 @@
 """Shapes in different poses: piecewise rigid transforms, and initial maps independent of pose.
 
-And who pays for them.
+And when they are computed.
 """
 
 from dataclasses import replace

@@ -1,6 +1,6 @@
 """Consistent latent basis and Consistent ZoomOut (3.4).
 
-Exactly consistent maps are closed exactly.
+Exactly consistent maps have no cycle error.
 """
 
 import itertools

@@ -26,7 +26,7 @@ def distances(Q, D):
 
 
 def check(Q, D, found):
-    """Each row found is as near as the nearest one.
+    """Each result is as near as the nearest row.
 
     Up to float32 rounding of the squared distance.
     """

@@ -1,4 +1,4 @@
-"""The network of maps (3.4): which pairs, initial maps, cycles."""
+"""The network of maps (3.4): pairs, initial maps, cycles."""
 
 import itertools
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Joint refinement and displacement (eq. 8): simulated deformations, and the score of a match."""
+"""Spectral ICP and displacement (eq. 8): simulated deformations, and the score of a match."""
 
 from dataclasses import replace
 

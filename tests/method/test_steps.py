@@ -1,4 +1,4 @@
-"""The steps one by one are those of an analysis, and the formulas of the paper on stored arrays."""
+"""The separate steps equal those of an analysis, and the formulas of the paper on stored arrays."""
 
 import numpy as np
 import pytest
