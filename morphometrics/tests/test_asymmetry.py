@@ -281,7 +281,7 @@ def test_what_cannot_be_tested_is_an_error(halves):
         asymmetry(study, subject="subject")
     with pytest.raises(ValueError, match="of must be 'vector' or 'normal'"):
         asymmetry(study, of="size")
-    with pytest.raises(ValueError, match="4 needed, or fewer"):
+    with pytest.raises(ValueError, match="use 4 shapes, fewer"):
         Model.one_sample(3).vertex_test(np.ones((3, 5, 3)))
     d = fields(7, 4)
     twice = matching(d, d)

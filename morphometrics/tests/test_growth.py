@@ -124,7 +124,7 @@ def test_a_field_grows_too(simulated):
     assert np.allclose(fit["field_within_effect"].values[TOP], 0.4, atol=0.1)
     assert fit["field_effect"].attrs["units"] == "mm"
     assert (fit["p_family_wise"].values[TOP] < 0.05).all()
-    with pytest.raises(ValueError, match="moves no vertex"):
+    with pytest.raises(ValueError, match="show the field_effect"):
         statistics.predict(study, fit, 1.0)
 
 
@@ -172,7 +172,7 @@ def test_what_is_no_repeated_measure_is_refused_or_told(simulated, caplog):
     options = {"n_permutations": 99}
     with pytest.raises(ValueError, match="two subjects that were seen at different times, found 0"):
         growth(simulated, "age", [f"q{i}" for i in range(24)], **options)
-    with pytest.raises(ValueError, match="needs a time of numbers, found text such as 'f'"):
+    with pytest.raises(ValueError, match="needs a time of numbers; found text such as 'f'"):
         growth(simulated, "sex", "person", **options)
     with pytest.raises(ValueError, match="24 shapes"):
         growth(simulated, "age", ["a", "b"], **options)

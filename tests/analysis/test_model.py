@@ -1,4 +1,4 @@
-"""Components of all shapes but one, from those of all, beside those computed again."""
+"""Components of all shapes but one, from those of all, compared with a direct computation."""
 
 import numpy as np
 import pytest

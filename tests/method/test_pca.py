@@ -1,6 +1,6 @@
-"""Principal modes (6.1): simulated modes come back with their variances.
+"""Modes of variation (6.1): simulated modes are recovered with their variances.
 
-Every shape is made again from its scores.
+Every shape is reconstructed from its scores.
 """
 
 import numpy as np
