@@ -120,7 +120,7 @@ def test_a_field_that_does_not_fit_is_refused_by_shape(study, caplog):
         with_field(study, "f", good | {second: np.r_[np.inf, good[second][1:]]})
     with pytest.raises(ValueError, match=f"of {second} is NaN everywhere"):
         with_field(study, "f", good | {second: good[second] * np.nan})
-    with pytest.raises(ValueError, match="values for nobody, which are no shapes"):
+    with pytest.raises(ValueError, match="values for nobody, which are not shapes"):
         with_field(study, "f", good | {"nobody": good[first]})
     with pytest.raises(ValueError, match="one array for each of 4 shapes, found 2"):
         with_field(study, "f", [good[first], good[second]])
@@ -167,7 +167,7 @@ def test_the_slope_of_a_field_is_that_of_least_squares(simulated):
     for refused in (statistics.predict, statistics.regression_modes):
         with pytest.raises(ValueError, match="a field moves no vertex"):
             refused(simulated, fit, *([1.0] if refused is statistics.predict else []))
-    with pytest.raises(ValueError, match="a field has no part along the normals"):
+    with pytest.raises(ValueError, match="a field has no normal component"):
         growth(simulated, "age", "group", field="thickness", of="normal")
 
 
@@ -178,7 +178,7 @@ def test_vertices_and_shapes_without_a_field_are_left_out_and_told(simulated, ca
     values[7] = np.nan
     holed = with_carried(simulated, values)
     where = field_group_map(holed, "thickness", "group", n_permutations=99)
-    assert "lacks in some shape at 5 of" in caplog.text
+    assert "is missing in some shape at 5 of" in caplog.text
     assert "field 'thickness' has no value for 1 of 20 shapes" in caplog.text
     assert where.attrs["left_out"] == "shape_07"
     assert np.isnan(where["p_family_wise"].values[:5]).all()
@@ -186,7 +186,7 @@ def test_vertices_and_shapes_without_a_field_are_left_out_and_told(simulated, ca
     with pytest.raises(ValueError, match=r"no field 'curv'; it has thickness"):
         field_group_map(simulated, "curv", "group")
     same = with_carried(simulated, np.ones_like(values))
-    with pytest.raises(ValueError, match="the same in all shapes: there is nothing to test"):
+    with pytest.raises(ValueError, match="the same in all shapes: no variation to test"):
         field_group_map(same, "thickness", "group")
 
 

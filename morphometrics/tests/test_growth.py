@@ -170,7 +170,7 @@ def test_what_is_no_repeated_measure_is_refused_or_told(simulated, caplog):
     caplog.set_level(logging.WARNING)
     person = simulated["subjects"]["person"].values
     options = {"n_permutations": 99}
-    with pytest.raises(ValueError, match="two subjects that were seen at different times, found 0"):
+    with pytest.raises(ValueError, match="two subjects with visits at different times, found 0"):
         growth(simulated, "age", [f"q{i}" for i in range(24)], **options)
     with pytest.raises(ValueError, match="needs a time of numbers, found text such as 'f'"):
         growth(simulated, "sex", "person", **options)
@@ -183,7 +183,7 @@ def test_what_is_no_repeated_measure_is_refused_or_told(simulated, caplog):
     caplog.clear()
     alone = np.where(np.arange(24) == 23, "alone", person)
     fit = growth(simulated, "age", alone, **options)
-    assert "seen at one time only" in caplog.text
+    assert "visits at one time only" in caplog.text
     assert "alone" in caplog.text
     assert fit.attrs["once"] == 1
     unknown = np.where(np.arange(24) == 5, "", person)

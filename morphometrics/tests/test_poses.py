@@ -14,7 +14,7 @@ from s4a.geometry.mesh import vertex_areas
 from s4a.input.subjects import subjects as table_of
 from s4a.schema import dataset, in_unit
 from s4a_morphometrics import of_structure, structures, structures_modes, structures_of_new, within
-from s4a_morphometrics.poses import align_wholes, measured, pose_fields, poses_of
+from s4a_morphometrics.poses import align_wholes, measure_levels, pose_fields, poses_of
 from s4a_morphometrics.synthetic import bean, subjects
 
 SPHERE = s4a.synthetic.sphere(120)
@@ -147,7 +147,7 @@ def test_size_of_the_whole_is_taken_out_on_request():
     Y = Y * np.random.default_rng(0).uniform(0.8, 1.2, N)[:, None, None, None]
     assert share(structures(tree_of(Y), **FEW), "within") > 0.1
     with pytest.raises(ValueError, match="structures need subjects that differ"):
-        structures(tree_of(Y), scale=True)
+        structures(tree_of(Y), remove_size=True)
 
 
 def test_poses_and_shapes_that_vary_together_are_told_from_those_that_do_not():
@@ -227,7 +227,7 @@ def in_metres(Y):
 @pytest.mark.parametrize(
     "fault, words",
     [
-        (far_away, ["lie far from where they are in the other subjects", "s04 ("]),
+        (far_away, ["unusual relative pose", "s04 ("]),
         (mirrored, ["s04 ("]),
         (centred, ["left and right have the same centre in every subject"]),
         (in_metres, ["times as large as right: are both in the same unit?"]),
@@ -249,11 +249,11 @@ def test_usual_poses_are_not_told_of(caplog):
 def test_what_cannot_be_compared_is_refused():
     study = tree_of(drawn(0, pose=1))
     right = study["structures/right/registration"].to_dataset()
-    with pytest.raises(ValueError, match="a study of several structures needed"):
+    with pytest.raises(ValueError, match="a multi-structure study needed"):
         structures(of_structure(study, "left"))
     with pytest.raises(ValueError, match="no structure 'middle'; it has left, right"):
         of_structure(study, "middle")
-    with pytest.raises(ValueError, match="at least 4 subjects that have all of them, found 3 of 3"):
+    with pytest.raises(ValueError, match="at least 4 subjects with all structures needed, found 3"):
         structures(tree_of(drawn(0, pose=1, n=3)))
     study["structures/right/registration"] = xr.DataTree(in_unit(right, "m", of="mm"))
     with pytest.raises(ValueError, match="structures need one unit; found left: mm, right: m"):
@@ -266,17 +266,17 @@ def test_warnings_name_the_subject_that_lacks_a_structure(caplog):
     study["structures/left/registration"] = xr.DataTree(left)
     with caplog.at_level(logging.WARNING):
         assert structures(study, **FEW).sizes["shape"] == N - 1
-    assert "left out, as a structure is missing or flagged: s00 (no left)" in caplog.text
+    assert "left out, because a structure is missing or flagged: s00 (no left)" in caplog.text
 
 
 # ---- new subjects
 
 
-@pytest.mark.parametrize("scale", [False, True])
-def test_a_new_subject_is_where_it_would_be_in_the_study(scale):
+@pytest.mark.parametrize("remove_size", [False, True])
+def test_a_new_subject_is_where_it_would_be_in_the_study(remove_size):
     Y = drawn(3, pose=1, shape=1) * np.linspace(0.9, 1.1, N)[:, None, None, None]
     study = tree_of(Y)
-    found = structures(study, scale=scale, **FEW)
+    found = structures(study, remove_size=remove_size, **FEW)
     Q = Rotation.from_rotvec([0.2, -0.4, 0.3]).as_matrix()
     again = structures_of_new(found, tree_of_new(Y @ Q.T + [5, 0, -3], study))
     for name in ("pose_rotation", "pose_translation", "pose_size", "within_displacement"):
@@ -342,7 +342,7 @@ def test_of_registered_meshes_the_poses_and_shapes_are_those_that_were_made(seve
     areas = [vertex_areas(one["position"].values, one["corner_vertex"].values) for one in template]
     whole = align_wholes(np.array(points).reshape(6, 400, 3), np.concatenate(areas))
     each = [poses_of(whole[:, :200], areas[0]), poses_of(whole[:, 200:], areas[1])]
-    truth = measured(each, areas, **FEW)
+    truth = measure_levels(each, areas, **FEW)
     d = pose_fields(each[0].mean, areas[0], each[0].rotation, each[0].translation)
     rms = np.sqrt(np.einsum("n,snx->s", areas[0] / areas[0].sum(), d**2))
     assert np.allclose(truth["pose_size"][:, 0], rms)

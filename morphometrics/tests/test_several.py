@@ -19,7 +19,7 @@ from s4a_morphometrics import (
     structures_modes,
     structures_of_new,
 )
-from s4a_morphometrics.mirrored import mirrored_subjects, seen_together
+from s4a_morphometrics.mirrored import combine, mirrored_subjects
 from s4a_morphometrics.several import Part, named_subjects, parts_of
 from s4a_morphometrics.structures_commands import named_label
 from s4a_morphometrics.synthetic import subjects
@@ -124,9 +124,9 @@ def test_folders_of_one_and_of_several_are_not_taken_for_each_other(store, files
     for command in (s4a.open_study, s4a.verify):
         with pytest.raises(ValueError, match=r"has studies in it: give one of them.*ures.left"):
             command(store)
-    with pytest.raises(ValueError, match="is no study of several structures"):
+    with pytest.raises(ValueError, match="is not a multi-structure study"):
         open_structures(store / "structures/left")
-    with pytest.raises(ValueError, match="is no study of several structures and is not empty"):
+    with pytest.raises(ValueError, match="is not a multi-structure study and is not empty"):
         analyse_structures(files[0], table=files[1], store=store / "structures/left", **SMALL)
     (tmp_path / "structures").mkdir()
     (tmp_path / "structures/left").symlink_to(store / "structures/left")
@@ -134,7 +134,7 @@ def test_folders_of_one_and_of_several_are_not_taken_for_each_other(store, files
     with pytest.raises(ValueError, match="is a symbolic link, which is not followed"):
         open_structures(tmp_path)
     (tmp_path / "structures.json").write_text('{"structures": ["../left"]}')
-    with pytest.raises(ValueError, match=r"structures.json cannot be read, run again: shapes need"):
+    with pytest.raises(ValueError, match=r"structures.json cannot be read, run again: names"):
         open_structures(tmp_path)
 
 
@@ -149,7 +149,11 @@ def test_the_core_says_who_analyses_several_structures(six, files):
     "old, by, words",
     [
         ("subject_2,right", "subject_1,right", "has two of right: scan_right_0, scan_right_1"),
-        ("subject,", "person,", "columns 'structure' and 'subject' needed beside 'shape'; found"),
+        (
+            "subject,",
+            "person,",
+            "columns 'structure' and 'subject' needed in addition to 'shape'; found",
+        ),
         ("subject_2,right", "subject_2,NA", "scan_right_1 has 'NA' and 'subject_2'"),
         (",right,", ",left,", "has two of left"),
     ],
@@ -181,7 +185,7 @@ THREE = {f"subject_{i}": TWO for i in (1, 2, 3)}
         ({"a": {"le/ft": MESH, "right": MESH}}, {}, "names of shapes need"),
         ({"a": {"left": "no.ply", "right": MESH}, "b": TWO}, {}, "left: shape a: no.ply is no fil"),
         (THREE, {"template": "d"}, "template 'd' is none of the shapes"),
-        ({"a": TWO, "b": {"left": MESH}}, {}, "least 2 subjects that have it; right has a alone"),
+        ({"a": TWO, "b": {"left": MESH}}, {}, "least 2 subjects that have it; right has only a"),
         ({"a": TWO, "b": {}}, {}, "a mesh of a structure needed; b has none"),
     ],
 )
@@ -392,10 +396,10 @@ def test_structures_of_one_subject_are_mirrored_together_or_not_at_all():
         named_subjects("side=l", parts)
 
 
-def looks(hands):
-    """Of a, b, c and d beside each other, where `hands` are the signs of their hands."""
+def comparisons(signs):
+    """Comparisons of a, b, c and d, whose sides have these `signs`."""
     names = list("abcd")
-    table = np.outer(hands, hands) + np.diag([np.nan] * 4)
+    table = np.outer(signs, signs) + np.diag([np.nan] * 4)
     return {
         name: dataset(chirality=row).assign_coords(reference=names)
         for name, row in zip(names, table, strict=True)
@@ -403,31 +407,36 @@ def looks(hands):
 
 
 @pytest.mark.parametrize(
-    "left, right, chosen, told",
+    "left, right, mirrored, remarks",
     [
         ([0.9, 0.9, -0.9, 0.9], [0.9, 0.9, -0.9, 0.9], ["c"], []),
         # one that is like its mirror image says nothing against the other
         ([1.2, 1.2, -1.2, 1.2], [0.1] * 4, ["c"], []),
-        ([1.2, 1.2, -1.2, 1.2], [1.2] * 4, [], ["c is of both hands (left -1.44, right +1.44)"]),
+        (
+            [1.2, 1.2, -1.2, 1.2],
+            [1.2] * 4,
+            [],
+            ["c has structures of both sides (left -1.44, right +1.44)"],
+        ),
         # where one structure says more than the other, too
-        ([1.2, 1.2, -3, 1.2], [1.2, 1.2, 0.9, 1.2], [], ["c is of both hands (left -"]),
+        ([1.2, 1.2, -3, 1.2], [1.2, 1.2, 0.9, 1.2], [], ["c has structures of both sides (left -"]),
         (
             [1.8, 1.8, -1.8, 0.1],
             [1.8, 1.8, 1.8, 0.1],
             [],
-            ["cannot determine the side of d", "c is of both hands (left -"],
+            ["cannot determine the side of d", "c has structures of both sides (left -"],
         ),
     ],
 )
-def test_structures_say_together_of_which_hand_a_subject_is(left, right, chosen, told):
-    _, names, lines = mirrored_subjects({"left": looks(left), "right": looks(right)})
-    assert names == chosen
-    assert all(word in line for word, line in zip(told, lines, strict=True))
+def test_structures_together_determine_the_side_of_a_subject(left, right, mirrored, remarks):
+    _, names, lines = mirrored_subjects({"left": comparisons(left), "right": comparisons(right)})
+    assert names == mirrored
+    assert all(word in line for word, line in zip(remarks, lines, strict=True))
 
 
-def test_hands_add_up_and_one_subject_alone_is_of_no_hand():
-    both = {"left": looks([0.9, 0.9, -0.9, 0.9]), "right": looks([0.9, 0.9, -0.9, 0.9])}
-    assert seen_together(both)["a"]["chirality"].values[1] == pytest.approx(2 * 0.81 / np.sqrt(2))
-    hand, names, told = mirrored_subjects({"left": {}, "right": {}})
-    assert (hand, names) == ({}, [])
-    assert "needs at least two shapes" in told[0]
+def test_comparisons_are_added_and_a_single_subject_has_no_side():
+    both = {"left": comparisons([0.9, 0.9, -0.9, 0.9]), "right": comparisons([0.9, 0.9, -0.9, 0.9])}
+    assert combine(both)["a"]["chirality"].values[1] == pytest.approx(2 * 0.81 / np.sqrt(2))
+    chirality, names, remarks = mirrored_subjects({"left": {}, "right": {}})
+    assert (chirality, names) == ({}, [])
+    assert "needs at least two shapes" in remarks[0]
