@@ -117,8 +117,8 @@ def field_group_map(
     >>> height = {name: mesh["position"].values[:, 2] for name, mesh in meshes}
     >>> study = s4a_morphometrics.with_field(study, "height", height)
     >>> group = ["a", "a", "a", "b", "b", "b"]
-    >>> where = s4a_morphometrics.field_group_map(study, "height", group, n_permutations=99)
-    >>> where["field_effect"].dims
+    >>> result = s4a_morphometrics.field_group_map(study, "height", group, n_permutations=99)
+    >>> result["field_effect"].dims
     ('vertex',)
     """
     options = check_options(n_permutations, variances, seed_of(seed, rng))
@@ -231,8 +231,8 @@ def field_classify(
     >>> height = {name: mesh["position"].values[:, 2] for name, mesh in meshes}
     >>> study = s4a_morphometrics.with_field(study, "height", height)
     >>> group = ["a", "a", "a", "b", "b", "b"]
-    >>> found = s4a_morphometrics.field_classify(study, "height", group, n_permutations=9)
-    >>> found.attrs["chance"]
+    >>> result = s4a_morphometrics.field_classify(study, "height", group, n_permutations=9)
+    >>> result.attrs["chance"]
     0.5
     """
     check_permutations(n_permutations)

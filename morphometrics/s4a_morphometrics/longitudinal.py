@@ -309,20 +309,20 @@ def _with_subjects(study, sample, subject):
     values = (str(value) for value in values_of(study, subject, "subject").tolist())
     subject_of = dict(zip(names, values, strict=True))
     subjects = np.array([subject_of[shape] for shape in shapes.tolist()])
-    known = (subjects != "") & (subjects != "nan")
-    if not known.all():
-        lacking = shapes[~known].tolist()
+    present = (subjects != "") & (subjects != "nan")
+    if not present.all():
+        lacking = shapes[~present].tolist()
         log.warning("left out, because the subject is missing: %s", listed(lacking, most=9))
         attributes = {**sample.attributes}
         attributes["left_out"] = ", ".join(filter(None, [attributes["left_out"], *lacking]))
         sample = sample._replace(
-            registration=sample.registration.isel(shape=known),
-            d=sample.d[known],
-            values=sample.values[known],
-            Z=None if sample.Z is None else sample.Z[known],
+            registration=sample.registration.isel(shape=present),
+            d=sample.d[present],
+            values=sample.values[present],
+            Z=None if sample.Z is None else sample.Z[present],
             attributes=attributes,
         )
-    return sample, subjects[known]
+    return sample, subjects[present]
 
 
 def _repeated(t, subject):

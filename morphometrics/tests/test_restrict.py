@@ -133,7 +133,7 @@ def test_size_that_was_taken_out_is_given_back():
     for name in shapes:  # where the files lie, before and after
         ends = [image_in_shape(position, s["registration"].sel(shape=name)) for s in (scaled, back)]
         assert np.allclose(*ends, atol=1e-4)
-    with pytest.raises(ValueError, match="size was not taken out"):
+    with pytest.raises(ValueError, match="of this study include size"):
         with_size(kept)
 
 
