@@ -54,7 +54,7 @@ def study_of(d, mesh=MESH, **subjects):
 
 
 def bump():
-    """A push outward around a place on the right, of height 1 (n, 3), and where it is high."""
+    """An outward bump at a point on the right, of height 1 (n, 3), and the mask of its top."""
     X, T = MESH
     height = np.exp(-((X - [1.7, 1.0, 0.6]) ** 2).sum(1) / 0.5)
     return height[:, None] * vertex_normals(X, T), height > 0.5
@@ -105,9 +105,11 @@ def test_the_parts_add_up_and_the_asymmetry_changes_sign_on_the_other_side(partn
     np.testing.assert_allclose(symmetric, plane(mean + s), atol=0.05)
     # each shape is the consensus, its symmetric part and its asymmetry, moved
     shape = X + study["registration"]["displacement"].values[3]
-    gap = np.linalg.norm(shape[:, None, :] - shape[None], axis=-1)
+    distance = np.linalg.norm(shape[:, None, :] - shape[None], axis=-1)
     ours = mean + s[3] + a[3]
-    np.testing.assert_allclose(np.linalg.norm(ours[:, None, :] - ours, axis=-1), gap, atol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(ours[:, None, :] - ours, axis=-1), distance, atol=1e-5
+    )
     # the table: sums of squares over both sides
     area = vertex_areas(X, T) / vertex_areas(X, T).sum()
     total = sum(((s + sign * a) ** 2).sum(-1).sum(0) @ area for sign in (1, -1))
@@ -182,7 +184,7 @@ def test_antisymmetry_is_distinguished_from_directional_asymmetry(partners):
 
 
 def matching(d_left, d_right, **columns):
-    """A study of the left and right shapes of subjects, of one hand."""
+    """A study of left and right shapes of subjects, one side mirrored."""
     n = len(d_left)
     columns = {
         "subject": [f"p{i}" for i in range(n)] * 2,
@@ -209,7 +211,7 @@ def test_both_sides_of_subjects_are_compared_and_the_larger_side_is_found():
     assert p > 0.05
 
 
-def test_what_triangles_and_partners_leave_is_no_asymmetry_of_the_whole_shape(partners):
+def test_errors_of_triangles_and_partners_are_not_asymmetry(partners):
     shapes = fields(3, 16, symmetric=0.1, fluctuating=0.002)  # less than the triangles leave
     for of in ("normal", "vector"):
         found = asymmetry(study_of(shapes), partners=partners, of=of, **OPTIONS)
@@ -281,13 +283,13 @@ def test_a_subject_with_one_side_is_left_out_by_name_and_sides_are_checked(caplo
     assert "the run mirrored" not in caplog.text
 
 
-def test_what_cannot_be_tested_is_an_error(partners):
+def test_untestable_studies_are_errors(partners):
     study = study_of(fields(7, 6))
     with pytest.raises(ValueError, match="both subject and side"):
         asymmetry(study, subject="subject")
     with pytest.raises(ValueError, match="of must be 'vector' or 'normal'"):
         asymmetry(study, of="size")
-    with pytest.raises(ValueError, match="4 needed, or fewer"):
+    with pytest.raises(ValueError, match="too few for a test.*use 4 shapes"):
         Model.one_sample(3).vertex_test(np.ones((3, 5, 3)))
     d = fields(7, 4)
     twice = matching(d, d)
@@ -331,10 +333,10 @@ def test_p_values_of_a_mean_of_zero_are_uniform():
     assert 0.03 < np.mean([(p <= 0.05).mean() for _, p, _ in found]) < 0.07
 
 
-@pytest.mark.parametrize("spread", [[1, 1, 1, 1, 1, 1], [9, 2, 1, 1, 1, 1], [1]])
-def test_p_of_antisymmetry_is_uniform_for_normal_individuals_of_any_covariance(spread):
-    rng = np.random.default_rng(len(spread))
-    drawn = rng.normal(size=(400, 15, len(spread))) * spread
+@pytest.mark.parametrize("deviations", [[1, 1, 1, 1, 1, 1], [9, 2, 1, 1, 1, 1], [1]])
+def test_p_of_antisymmetry_is_uniform_for_normal_individuals_of_any_covariance(deviations):
+    rng = np.random.default_rng(len(deviations))
+    drawn = rng.normal(size=(400, 15, len(deviations))) * deviations
     found = [antisymmetry_test(individuals)[1] for individuals in drawn]
     assert stats.kstest(found, "uniform").pvalue > 0.01
 
@@ -351,8 +353,8 @@ def test_the_template_of_a_study_finds_its_other_side(study):
     there = interpolate(X, T, *place)
     plane = plane_between(X, there, vertex_areas(X, T))
     assert abs(plane.normal[0]) > 0.98  # brains are nearly symmetric in x
-    gap = np.linalg.norm(plane(X) - there, axis=1)
-    assert np.median(gap) < 0.1 * np.sqrt(vertex_areas(X, T).sum())
+    distance = np.linalg.norm(plane(X) - there, axis=1)
+    assert np.median(distance) < 0.1 * np.sqrt(vertex_areas(X, T).sum())
 
 
 def test_a_symmetric_template_has_half_of_a_bump_on_each_side(partners):
@@ -363,13 +365,13 @@ def test_a_symmetric_template_has_half_of_a_bump_on_each_side(partners):
     S = mesh["position"].values
     assert (mesh["corner_vertex"].values == T).all()
     place = partners["partner_triangle"].values, partners["partner_barycentric"].values
-    gaps = []
+    distances = []
     for P in (study["registration"]["position"].values, S):  # how far from its mirror image
         there = interpolate(P, T, *place)
         plane = plane_between(P, there, vertex_areas(P, T))
         assert abs(plane.normal[0]) > 0.99
-        gaps.append(np.linalg.norm(plane(there) - P, axis=1))
-    assert gaps[1].max() < 0.15 * gaps[0].max()
+        distances.append(np.linalg.norm(plane(there) - P, axis=1))
+    assert distances[1].max() < 0.15 * distances[0].max()
     moved = ((S - X) * vertex_normals(X, T)).sum(1)
     opposite = np.exp(-((X * M - [1.7, 1.0, 0.6]) ** 2).sum(1) / 0.5) > 0.5
     for side in (high, opposite):
@@ -418,7 +420,7 @@ def test_the_command_writes_tables_and_a_page(study_folder, tmp_path, capsys):
     with open_study(study_folder) as study:
         template = study["registration"].to_dataset()
         assert (template["corner_vertex"].values == T).all()
-        gap = np.linalg.norm(template["position"].values - X, axis=1)
-    assert 0 < gap.mean() < 5  # mm
+        distance = np.linalg.norm(template["position"].values - X, axis=1)
+    assert 0 < distance.mean() < 5  # mm
     assert cli.main([*command, "--subject", "person"]) == 2
     assert "both subject and side" in capsys.readouterr().err

@@ -69,7 +69,7 @@ def tree_of_new(Y, study):
 
 
 def without_poses(Y):
-    """Points of which every structure is moved back to one place."""
+    """Points with all structures moved to a common pose."""
     found = [poses_of(Y[:, k], AREA) for k in range(2)]
     return np.stack([one.mean + one.shape for one in found], axis=1)
 
@@ -80,7 +80,7 @@ def share(found, level):
 
 
 def test_the_two_levels_add_up_to_the_joint_one_without_a_rest():
-    study = tree_of(drawn(0, pose=2, shape=3))  # turns of 11 degrees, so that nothing is small
+    study = tree_of(drawn(0, pose=2, shape=3))  # rotations of 11 degrees, which are not small
     found = structures(study, **FEW)
     assert share(found, "between") > 0.15 < share(found, "within")
     assert float(found["level_share"].sum()) == pytest.approx(1, abs=1e-12)
@@ -94,7 +94,7 @@ def test_the_two_levels_add_up_to_the_joint_one_without_a_rest():
     assert np.allclose(joint["standard_deviation"], found["standard_deviation"], rtol=1e-5)
 
 
-def test_shapes_have_no_shift_and_no_turn_left():
+def test_shapes_have_no_translation_or_rotation():
     Y = drawn(1, pose=3, shape=2)[:, 0]
     found = poses_of(Y, AREA)
     g = AREA @ found.mean / AREA.sum()
@@ -127,12 +127,12 @@ def test_known_poses_are_found_relative_to_the_whole():
     found = structures(tree_of(Y), **FEW)
     rotation, translation = found["pose_rotation"].values, found["pose_translation"].values
     assert np.allclose(rotation[:, 0] - rotation[:, 1], sign * turn, atol=0.02)
-    # the whole is turned back: the structures lie 32 mm from each other
+    # the alignment rotates the whole back: the structures are 32 mm independent
     assert np.allclose((translation[:, 0] - translation[:, 1])[:, 0], 0, atol=0.2)
     assert (np.sign(rotation[:, 0, 2]) == sign[:, 0]).all()
 
 
-def test_where_a_subject_lies_in_its_scan_changes_nothing():
+def test_the_pose_of_a_subject_in_its_scan_has_no_effect():
     Y = drawn(3, pose=1, shape=1)
     rng = np.random.default_rng(0)
     frames = Rotation.from_rotvec(2 * rng.normal(size=(N, 3))).as_matrix()
@@ -142,7 +142,7 @@ def test_where_a_subject_lies_in_its_scan_changes_nothing():
     assert np.allclose(one["pose_size"], other["pose_size"], rtol=1e-6)
 
 
-def test_size_of_the_whole_is_taken_out_on_request():
+def test_size_of_the_whole_is_removed_on_request():
     Y = np.broadcast_to(BEAN + APART[:, None], (N, 2, *BEAN.shape))
     Y = Y * np.random.default_rng(0).uniform(0.8, 1.2, N)[:, None, None, None]
     assert share(structures(tree_of(Y), **FEW), "within") > 0.1
@@ -150,15 +150,15 @@ def test_size_of_the_whole_is_taken_out_on_request():
         structures(tree_of(Y), remove_size=True)
 
 
-def test_poses_and_shapes_that_vary_together_are_told_from_those_that_do_not():
+def test_covarying_poses_and_shapes_are_distinguished_from_independent_ones():
     rng = np.random.default_rng(5)
-    apart = drawn(6, pose=1, shape=1, n=16)
-    together = np.empty_like(apart)
+    independent = drawn(6, pose=1, shape=1, n=16)
+    together = np.empty_like(independent)
     for i, score in enumerate(rng.normal(size=16)):
         for k in range(2):
             together[i, k] = bean(U, 0.15 * score) + APART[k] + [0, 2.0 * score * (-1) ** k, 0]
-    still = without_poses(apart)
-    shifted = still + (apart - still).mean(2)[:, :, None]
+    still = without_poses(independent)
+    shifted = still + (independent - still).mean(2)[:, :, None]
     p = [
         float(structures(tree_of(Y), n_permutations=199)["pose_shape_p"])
         for Y in (together, shifted)
@@ -182,7 +182,7 @@ def test_a_group_that_differs_in_poses_is_found_between_structures_and_not_withi
     assert p["within"] > 0.05
 
 
-def test_a_level_is_a_study_for_what_takes_one(tmp_path):
+def test_a_level_is_a_study_for_tests_and_pages(tmp_path):
     study = tree_of(drawn(0, pose=1, shape=1))
     found = structures(study, **FEW)
     of_level = structures_modes(study, found, "between")
@@ -233,20 +233,20 @@ def in_metres(Y):
         (in_metres, ["times as large as right: are both in the same unit?"]),
     ],
 )
-def test_structures_that_do_not_fit_together_are_told_of(fault, words, caplog):
+def test_structures_that_do_not_fit_together_are_reported(fault, words, caplog):
     Y = drawn(9, pose=1, shape=1)
     fault(Y)
     structures(tree_of(Y), **FEW)
     assert all(word in caplog.text for word in words)
 
 
-def test_usual_poses_are_not_told_of(caplog):
+def test_usual_poses_are_not_reported(caplog):
     for seed in range(20):
         structures(tree_of(drawn(seed, pose=1, shape=1)), **FEW)
     assert not caplog.text
 
 
-def test_what_cannot_be_compared_is_refused():
+def test_structures_that_cannot_be_compared_are_refused():
     study = tree_of(drawn(0, pose=1))
     right = study["structures/right/registration"].to_dataset()
     with pytest.raises(ValueError, match="a multi-structure study needed"):

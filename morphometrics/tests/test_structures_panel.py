@@ -1,4 +1,4 @@
-"""The panel of several structures, without a browser."""
+"""The panel of multi-structure studies, without a browser."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from s4a_morphometrics.structures_panel import Structures
 
 @pytest.fixture
 def panel(several):
-    """The panel, of which nothing is left after the test."""
+    """The panel; all its widgets are closed after the test."""
     before = len(registry._instances)
     made = Structures(several, result=structures(several, n_permutations=9))
     yield made
