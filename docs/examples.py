@@ -14,7 +14,7 @@ def figure_of(name, text):
     All examples are run in their order; what they print is checked where they are tests.
     """
     examples = doctest.DocTestParser().get_examples(text, name)
-    if not examples or not examples[-1].want.startswith(("<Figure ", "<Parts ")):
+    if not examples or not examples[-1].want.startswith(("<Figure ", "<TiledFigure ")):
         return None
     names = {}
     for example in examples[:-1]:

@@ -25,7 +25,7 @@ from s4a.geometry.mesh import as_arrays
 from s4a.show.browser import PARTS
 from s4a.show.draw import CLAY, data_uri, image_bytes, on_white, render
 from s4a.show.panel_page import panel_html
-from s4a.show.parts import Parts
+from s4a.show.tiled_figure import TiledFigure
 from s4a.widgets import threejs
 from s4a.widgets.explore import Explore
 from s4a.widgets.panel import KernelWidget
@@ -226,7 +226,7 @@ def html_of(value):
     """Output of a value in a cell, as HTML."""
     if value is None:
         return ""
-    if isinstance(value, Parts):
+    if isinstance(value, TiledFigure):
         return Markup(value.html())
     shown, _ = format_of.format(value)
     if "image/png" in shown:

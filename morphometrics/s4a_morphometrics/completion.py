@@ -137,7 +137,7 @@ def complete(
     >>> shown = {"the shape": mesh, "completed, with its deviation": found}
     >>> deviation = {"completed, with its deviation": found["completion_normal_sd"].values}
     >>> s4a.show.charts.surfaces(shown, deviation, label="mm")
-    <Parts ...>
+    <TiledFigure ...>
     """
     check_count("n_samples", n_samples)
     model = model_of(study)

@@ -44,7 +44,7 @@ class Region(Panel):
     >>> study = s4a.synthetic.example_study()
     >>> panel = Region(study, view="top")
     >>> square = [[0, -99], [99, -99], [99, 99], [0, 99]]
-    >>> panel.scene.drawn_around = {"polygon": square, "turn": panel.scene.turn, "count": 1}
+    >>> panel.scene.drawn_around = {"polygon": square, "rotation": panel.scene.rotation, "count": 1}
     >>> right = within(study, panel.region)
     >>> bool(right["registration"]["position"].values[:, 0].min() >= 0)
     True
@@ -94,7 +94,7 @@ class Region(Panel):
 
     def take_drawn(self, drawn: dict) -> None:
         """Add or remove the vertices inside the lasso."""
-        within = vertices_within(self.X, self.T, drawn["polygon"], drawn["turn"])
+        within = vertices_within(self.X, self.T, drawn["polygon"], drawn["rotation"])
         if not within.any():
             self.show_message("no visible vertex is inside the lasso; draw around some vertices")
             return

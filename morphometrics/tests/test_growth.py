@@ -124,7 +124,7 @@ def test_a_field_grows_too(simulated):
     assert np.allclose(fit["field_within_effect"].values[TOP], 0.4, atol=0.1)
     assert fit["field_effect"].attrs["units"] == "mm"
     assert (fit["p_family_wise"].values[TOP] < 0.05).all()
-    with pytest.raises(ValueError, match="moves no vertex"):
+    with pytest.raises(ValueError, match="a regression of displacements is needed"):
         statistics.predict(study, fit, 1.0)
 
 

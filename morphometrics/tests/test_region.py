@@ -25,8 +25,8 @@ def panel(study):
 def draw(panel, polygon, view):
     """What a drag sends."""
     count = panel.scene.drawn_around.get("count", 0) + 1
-    turn = rotation(view).ravel().tolist()
-    panel.scene.drawn_around = {"polygon": polygon, "turn": turn, "count": count}
+    rows = rotation(view).ravel().tolist()
+    panel.scene.drawn_around = {"polygon": polygon, "rotation": rows, "count": count}
 
 
 @pytest.mark.parametrize("n", [2000, 60_000])

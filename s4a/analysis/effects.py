@@ -176,7 +176,7 @@ def group_map(
     >>> X, T = s4a.geometry.mesh.as_arrays(mean)
     >>> normal = (result["effect"].values * s4a.geometry.mesh.vertex_normals(X, T)).sum(1)
     >>> s4a.show.charts.surfaces({"b minus a": mean}, {"b minus a": normal}, label="mm")
-    <Parts ...>
+    <TiledFigure ...>
     """
     options = check_options(n_permutations, variances, seed_of(seed, rng))
     return map_groups(sample_of(study, group, "group", covariates), options, of)
@@ -349,7 +349,7 @@ def predict(study: xr.DataTree, fit: xr.Dataset, value: float) -> xr.Dataset:
     True
     >>> shapes = {f"age {age}": s4a.statistics.predict(study, fit, age) for age in (-5, 2.5, 10)}
     >>> s4a.show.charts.surfaces(shapes)
-    <Parts ...>
+    <TiledFigure ...>
     """
     check_moves(fit)
     template = study["registration"].to_dataset()

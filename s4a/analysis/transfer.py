@@ -523,7 +523,7 @@ def transfer_labels(
     ...     {"template": colors[label], "transferred": colors[transferred]},
     ...     flat=True,
     ... )
-    <Parts ...>
+    <TiledFigure ...>
     """
     if blur is not None and not 0 <= blur <= 10:
         raise ValueError(f"blur needs a factor from 0 to 10; found {blur}")
@@ -691,7 +691,7 @@ def transfer_landmarks(
     ...     Y, S, colors[name] = with_balls(X, T, None, np.c_[points, hues, radii].tolist())
     ...     shown[name] = s4a.geometry.mesh.as_dataset(Y, S)
     >>> s4a.show.charts.surfaces(shown, colors)
-    <Parts ...>
+    <TiledFigure ...>
     """
     mesh, routes_to_targets = plan(study, source, targets, options)
     landmarks = as_landmarks(landmarks)

@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Polygon, Rectangle
 from scipy.spatial import Delaunay
 
-from s4a.show.charts import BLUE, GREY, LOOK, ORANGE
+from s4a.show.charts import BLUE, GREY, ORANGE, STYLE
 from s4a.show.draw import SIGNED
-from s4a.show.parts import Parts
+from s4a.show.tiled_figure import TiledFigure
 
 SOFT = {"blue": "#cfe4f2", "orange": "#f7d9c4", "grey": "#eeeeee", "green": "#cdebe0"}
 
@@ -260,13 +260,13 @@ def slid() -> Figure:
 
 def _plain(draw, columns, width, height):
     """Return axes without frames; the alternative text comes from the docstring of `draw`."""
-    with rc_context(LOOK):
-        figure = Parts(figsize=(width, height), layout="constrained", dpi=120)
+    with rc_context(STYLE):
+        figure = TiledFigure(figsize=(width, height), layout="constrained", dpi=120)
         axes = figure.subplots(1, columns, squeeze=False)
     figure.alt = " ".join((draw.__doc__ or "\n\n").split("\n\n")[1].split())
     for ax in axes.flat:
         ax.set_axis_off()
-        ax.title.set_fontsize(LOOK["axes.titlesize"])
+        ax.title.set_fontsize(STYLE["axes.titlesize"])
     return figure, axes
 
 

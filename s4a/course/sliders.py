@@ -53,7 +53,7 @@ def slide(draw: "Callable[..., Figure]", **sliders: "ipywidgets.Widget") -> "ipy
 
     import ipywidgets
 
-    from s4a.show.parts import GROW
+    from s4a.show.tiled_figure import GROW
 
     picture = ipywidgets.Image()
     message = ipywidgets.HTML()
@@ -116,7 +116,7 @@ def takeaway(sentence: str, *figures: "Figure") -> "Figure":
     """
     from PIL import Image
 
-    from s4a.show.parts import Parts
+    from s4a.show.tiled_figure import TiledFigure
 
     pictures = [np.asarray(Image.open(io.BytesIO(_png(figure)[0]))) for figure in figures]
     ratios = [picture.shape[1] / picture.shape[0] for picture in pictures]
@@ -127,7 +127,7 @@ def takeaway(sentence: str, *figures: "Figure") -> "Figure":
     # a smaller scale would make the text of the figures too small to read
     height = min(3.2, (width - space * len(ratios)) / sum(ratios))
     height = max(height, MIN_SCALE * max(heights))
-    summary = Parts(figsize=(height * sum(ratios) + space * (len(ratios) - 1), height + 0.35))
+    summary = TiledFigure(figsize=(height * sum(ratios) + space * (len(ratios) - 1), height + 0.35))
     grid = {"left": 0, "right": 1, "bottom": 0, "top": height / (height + 0.35)}
     grid["wspace"] = space * len(ratios) / summary.get_figwidth()
     axes = summary.subplots(1, len(ratios), squeeze=False, width_ratios=ratios, gridspec_kw=grid)

@@ -607,7 +607,7 @@ def brains(
 
     >>> shapes = s4a.synthetic.brains(4, 3000)["original"].children
     >>> s4a.show.charts.surfaces({name: mesh.to_dataset() for name, mesh in shapes.items()})
-    <Parts ...>
+    <TiledFigure ...>
     """
     seed = seed_of(seed, rng)
     truth = simulate(n, seed, n_modes=n_modes)

@@ -713,10 +713,10 @@ def _values(data, file, name):
     if file.endswith(".npy"):
         return npy(data)
     if file.endswith(".gii"):
-        columns = [values for _, values in gifti_arrays(data) if values.ndim == 1]
-        if not columns:
+        vectors = [values for _, values in gifti_arrays(data) if values.ndim == 1]
+        if not vectors:
             raise ValueError("a GIFTI array of one dimension expected, found none")
-        return columns[0]
+        return vectors[0]
     return _column(text_of(data), name)
 
 

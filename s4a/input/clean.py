@@ -570,8 +570,8 @@ def _pairs_around_edges(P, F, group, edge_of, count):
     for k in range(3, _MOST_AROUND_EDGE + 1):
         around = order[start_of_edge[count == k][:, None] + np.arange(k)]  # (edges, k) half-edges
         pairs += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
-    pairs = np.concatenate(pairs)
-    h, g = pairs.T
+    pair = np.concatenate(pairs)
+    h, g = pair.T
     m = len(F)
     normal = triangle_normals(P, F)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -582,7 +582,7 @@ def _pairs_around_edges(P, F, group, edge_of, count):
     corner = F.T.ravel()
     towards = P[corner[(g + 2 * m) % (3 * m)]] - P[corner[h]]  # to the third corner of the mate
     convex = np.einsum("ij,ij->i", normal[h % m], towards) < 0
-    return pairs, np.round(1 - cos, 6) + 4 * twisted - 1e-7 * convex
+    return pair, np.round(1 - cos, 6) + 4 * twisted - 1e-7 * convex
 
 
 def _orient(P, F, group, mate, counts):

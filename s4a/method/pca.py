@@ -295,7 +295,7 @@ def synthesize(study: xr.DataTree, scores: Array) -> xr.Dataset:
     >>> larger = s4a.analyse(brains, n_coarse=500, k=40, intersections=False)
     >>> along = {f"{x:+} sd": s4a.synthesize(larger, [float(x)]) for x in (-2, 0, 2)}
     >>> s4a.show.charts.surfaces(along, view="left")
-    <Parts ...>
+    <TiledFigure ...>
     """
     check_type(study, xr.DataTree)
     scores = np.atleast_1d(np.asarray(scores, float))

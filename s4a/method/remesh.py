@@ -342,7 +342,7 @@ def coarsen(
     >>> brain = s4a.synthetic.brains(1, 4000)["original/brain_01"].to_dataset()
     >>> few = s4a.coarsen(brain, n_coarse=500)
     >>> s4a.show.charts.surfaces({"4,000 vertices": brain, "500 vertices": few})
-    <Parts ...>
+    <TiledFigure ...>
     """
     seed = seed_of(seed, rng)
     mesh = as_mesh(mesh)

@@ -191,7 +191,7 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     >>> Phi = ball["eigenfunction"].values
     >>> waves = {f"eigenfunction {i}": Phi[:, i] for i in (1, 4, 8)}
     >>> s4a.show.charts.surfaces(dict.fromkeys(waves, ball), waves, label="eigenfunction")
-    <Parts ...>
+    <TiledFigure ...>
     """
     require(mesh, "vertex_area", "edge_vertex", "cotan_weight", what="mesh")
     check_count("k", k, 1)
@@ -287,7 +287,7 @@ def reconstruct(mesh: xr.Dataset, f: Array, *, k: int | None = None) -> Array:
     >>> smooth = {f"k = {k}": s4a.reconstruct(few, few["position"], k=k) for k in (10, 100)}
     >>> pictures = {k: few.assign(position=(few["position"].dims, X)) for k, X in smooth.items()}
     >>> s4a.show.charts.surfaces(pictures)
-    <Parts ...>
+    <TiledFigure ...>
     """
     require(mesh, "eigenfunction", "vertex_area", what="mesh")
     if k is not None:

@@ -409,8 +409,8 @@ class Study:
 
     def __contains__(self, node: str) -> bool:
         stage, _, name = node.partition("/")
-        node = self.tree.children.get(stage)
-        return node is not None and (not name or name in node.children)
+        shapes = self.tree.children.get(stage)
+        return shapes is not None and (not name or name in shapes.children)
 
     def __getitem__(self, node: str) -> xr.Dataset:
         return self.tree[node].to_dataset()

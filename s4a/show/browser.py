@@ -1,7 +1,6 @@
-"""What a browser gets: templates of pages, the scripts that draw, numbers as bytes and JSON.
+"""Templates and scripts for the browser, and the encoding of numbers as bytes and JSON.
 
-Templates are jinja2's and escape whatever is put into them; only what is :class:`Markup` already,
-such as another part of a page, goes in as it is.
+The jinja2 templates escape all values except :class:`Markup`, such as another part of a page.
 """
 
 import base64
@@ -23,7 +22,7 @@ FOLDER = Path(__file__).parent
 
 
 def script(*names: str) -> str:
-    """The text of some scripts, one after the other, as one module."""
+    """Concatenate scripts to one module."""
     files = [FOLDER / "esm" / f"{name}.js" for name in names]
     return "\n".join(file.read_text(encoding="utf-8") for file in files)
 
@@ -39,7 +38,7 @@ FRAME = script("dom", "frame_widget")
 
 
 def to_bytes(array: np.ndarray | list[Any], kind: str) -> bytes:
-    """The bytes of an array of numbers, little-endian and contiguous, as the browser reads them.
+    """Return an array as contiguous little-endian bytes.
 
     Examples
     --------
@@ -51,19 +50,19 @@ def to_bytes(array: np.ndarray | list[Any], kind: str) -> bytes:
 
 
 def color_bytes(colors: np.ndarray | list[Any]) -> bytes:
-    """Colours ``(n, 3)`` from 0 to 1 as bytes; rows that are not finite become grey."""
+    """Return colours ``(n, 3)`` from 0 to 1 as bytes; non-finite rows are grey."""
     colors = np.asarray(colors, float)
     known = np.where(np.isfinite(colors), np.clip(colors, 0, 1), UNKNOWN)
     return to_bytes(255 * known + 0.5, "uint8")
 
 
 def palette(colormap: str | Colormap) -> bytes:
-    """The 256 colours of a colour map as bytes."""
+    """Return 256 colours of a colour map as bytes."""
     return color_bytes(colormaps.get_cmap(colormap)(np.linspace(0, 1, 256))[:, :3])
 
 
 def color_scale(colormap: str | Colormap, low: float, high: float, label: str) -> dict[str, Any]:
-    """What the browser draws as a colour bar: eleven colours, the numbers of both ends, a label."""
+    """Return a colour bar for the browser: eleven colours, the values at both ends, a label."""
     colors = colormaps.get_cmap(colormap)(np.linspace(0, 1, 11))
     return {
         "colors": [to_hex(color) for color in colors],
@@ -74,7 +73,7 @@ def color_scale(colormap: str | Colormap, low: float, high: float, label: str) -
 
 
 def mesh_state(mean: np.ndarray, triangles: np.ndarray, deformation: np.ndarray) -> dict[str, Any]:
-    """The bytes of a mean shape ``(n, 3)``, its triangles and deformations ``(c, n, 3)``."""
+    """Return a mean shape ``(n, 3)``, its triangles and deformations ``(c, n, 3)`` as bytes."""
     return {
         "mean": to_bytes(mean, "float32"),
         "corner": to_bytes(triangles, "uint32"),
@@ -82,8 +81,10 @@ def mesh_state(mean: np.ndarray, triangles: np.ndarray, deformation: np.ndarray)
     }
 
 
-def look_state(limits: tuple[float, float], unit: str, view: Viewpoint, up: str) -> dict[str, Any]:
-    """Colours of the modes, full at the two `limits`, and from where they are seen first."""
+def appearance_state(
+    limits: tuple[float, float], unit: str, view: Viewpoint, up: str
+) -> dict[str, Any]:
+    """Return the colour scales of modes, which end at the two `limits`, and the initial view."""
     along, distance = limits
     signed = f"compression · normal displacement ({unit}) · expansion"
     scales = {
@@ -97,12 +98,12 @@ def look_state(limits: tuple[float, float], unit: str, view: Viewpoint, up: str)
         "limit": along,
         "limit_magnitude": distance,
         "bars": scales,
-        "turn": rotation(view, up).ravel().tolist(),
+        "rotation": rotation(view, up).ravel().tolist(),
     }
 
 
 def to_json(value: object) -> Markup:
-    """A value as JSON that may stand in a page; bytes in base 64, as ``{"base64": ...}``.
+    """Return a value as JSON for a page; bytes are encoded as ``{"base64": ...}``.
 
     Examples
     --------
@@ -111,19 +112,19 @@ def to_json(value: object) -> Markup:
     {"n": 1, "b": {"base64": "YWJj"}, "text": "\\u003c/script\\u003e"}
     """
 
-    def of_bytes(other):
+    def encode(other):
         if isinstance(other, bytes):
             return {"base64": base64.b64encode(other).decode()}
-        raise TypeError(f"{type(other).__name__} cannot be kept in a page")
+        raise TypeError(f"{type(other).__name__} cannot be stored in a page")
 
-    return htmlsafe_json_dumps(value, default=of_bytes, ensure_ascii=False)
+    return htmlsafe_json_dumps(value, default=encode, ensure_ascii=False)
 
 
 # ---- templates
 
 
 def numeral(value: object) -> str:
-    """A number with commas between its thousands, and one decimal if it is no integer; or text.
+    """Format a number with thousands separators, and one decimal unless it is an integer.
 
     Examples
     --------
@@ -139,17 +140,17 @@ def numeral(value: object) -> str:
 
 
 def webp_uri(pixels: np.ndarray) -> str:
-    """A rendered picture as the address of an image inside a page."""
+    """Return a rendered picture as a data URI."""
     return data_uri(image_bytes(pixels))
 
 
 def svg_uri(figure: Figure) -> str:
-    """A matplotlib Figure as the address of an image inside a page."""
+    """Return a matplotlib Figure as a data URI."""
     return data_uri(charts.svg(figure), "image/svg+xml")
 
 
 def for_page(text: str) -> Markup:
-    """A widget's script as a part of a page, where the widget is called ``widget``."""
+    """Return a widget's script for a page, as the constant ``widget``."""
     return Markup(text.replace("export default", "const widget =").replace("</", "<\\/"))
 
 
@@ -164,5 +165,5 @@ TEMPLATES.filters |= {
     function.__name__: function for function in (for_page, numeral, svg_uri, to_json, webp_uri)
 }
 TEMPLATES.globals |= {"script": lambda *names: Markup(script(*names)), "style": Markup(STYLE)}
-# its macros are functions that give Markup
+# its macros are functions that return Markup
 PARTS: Any = TEMPLATES.get_template("parts.html").module

@@ -1,4 +1,4 @@
-"""Charts of a study's numbers; every function takes arrays and gives a matplotlib Figure."""
+"""Charts of a study; the functions take arrays and return a matplotlib Figure."""
 
 import io
 import re
@@ -26,12 +26,12 @@ from s4a.show.draw import (
     render,
     signed_colors,
 )
-from s4a.show.parts import Parts
+from s4a.show.tiled_figure import TiledFigure
 
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#777777"
 PALE = "#bbbbbb"
 PART_COLORS = ("#bbbbbb", "#e69f00", "#009e73", BLUE, "#cc79a7", ORANGE, "#56b4e9", "#f0e442")
-LOOK: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -42,7 +42,7 @@ LOOK: dict[Any, Any] = {
 
 
 def svg(figure: Figure) -> bytes:
-    """The bytes of an SVG file of a Figure, the same for the same figure.
+    """Return a Figure as the bytes of an SVG file, which are reproducible.
 
     Examples
     --------
@@ -51,26 +51,26 @@ def svg(figure: Figure) -> bytes:
     True
     """
     file = io.BytesIO()
-    with rc_context(LOOK):
+    with rc_context(STYLE):
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
     return file.getvalue()
 
 
 def _figure(width, height, columns=1, rows=1, kind=Figure):
-    """A Figure of that many inches, and its axes ``(rows, columns)``."""
-    with rc_context(LOOK):
+    """Return a Figure of a size in inches, and its axes ``(rows, columns)``."""
+    with rc_context(STYLE):
         figure = kind(figsize=(width, height), layout="constrained")
         return figure, figure.subplots(rows, columns, squeeze=False)
 
 
 def on_circle(n: int) -> np.ndarray:
-    """Places ``(n, 2)`` spread evenly over the unit circle."""
+    """Return `n` equidistant points ``(n, 2)`` on the unit circle."""
     angle = 2 * np.pi * np.arange(n) / max(n, 1)
     return np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
 
 def reach(values: np.ndarray, share: float) -> float:
-    """The `share` quantile of the absolute numbers that are not NaN; 0 where all are.
+    """Return the `share` quantile of the absolute values without NaN; 0 if all are NaN.
 
     Examples
     --------
@@ -95,33 +95,37 @@ def surfaces(
     view: Viewpoint = "corner",
     up: str = "z",
 ) -> Figure:
-    """Pictures of surfaces side by side; in a narrow cell, below each other.
+    """Draw surfaces side by side, or below each other in a narrow cell.
 
     Parameters
     ----------
     meshes : dict of str to Dataset
         Title of each picture and its mesh.
     values : dict of str to float ndarray, optional
-        For the same titles colours ``(vertex, 3)``, or signed numbers ``(vertex,)``: these are
-        drawn on one scale from -`limit` to `limit`, blue positive, with a colour bar; of numbers
-        that are nowhere negative the bar begins at 0.  What is NaN is grey.
+        For the same titles, colours ``(vertex, 3)`` or numbers ``(vertex,)``.  Numbers are drawn
+        on one scale from -`limit` to `limit`, blue positive, with a colour bar, which begins at 0
+        if no number is negative.  NaN is grey.
     limit : float, optional
-        By default the largest 99 % quantile of the absolute numbers that are not NaN.
+        By default the largest 99 % quantile of the absolute values.
     label : str
-        Of the colour bar.
+        Label of the colour bar.
     columns : int
-        Most pictures in a row.
+        Largest number of pictures in a row.
     flat : bool
-        Colours of labels: they are not mixed within a triangle.
+        If True, colours are not interpolated within a triangle: for labels.
     one_frame : bool
-        All pictures show the same part of space, so that sizes and places can be compared; by
-        default each surface fills its picture.
+        If True, all pictures show the same part of space, so that sizes and positions can be
+        compared; by default each surface fills its picture.
     view, up
         See :func:`s4a.show.draw.rotation`.
 
     Returns
     -------
     matplotlib.figure.Figure
+
+    See Also
+    --------
+    s4a.widgets.threejs.surface : an interactive surface.
 
     Examples
     --------
@@ -130,15 +134,15 @@ def surfaces(
     >>> mesh = s4a.synthetic.sphere(2000)
     >>> height = mesh["position"].values[:, 2]
     >>> surfaces({"height": mesh}, {"height": height}, label="height")
-    <Parts ...>
+    <TiledFigure ...>
     """
     values = {title: np.asarray(array) for title, array in (values or {}).items()}
     signed = [array for array in values.values() if array.ndim == 1]
     if limit is None:
         limit = max((reach(array, 0.99) for array in signed), default=1.0) or 1.0
-    rows, wide = -(-len(meshes) // columns), min(columns, len(meshes))
-    width = 2.5 * wide + 0.7 * bool(signed)
-    figure, axes = _figure(width, 2.35 * rows, wide, rows, Parts)
+    rows, columns = -(-len(meshes) // columns), min(columns, len(meshes))
+    width = 2.5 * columns + 0.7 * bool(signed)
+    figure, axes = _figure(width, 2.35 * rows, columns, rows, TiledFigure)
     figure.alt = ", ".join(meshes)
     frame = None
     if one_frame:
@@ -151,91 +155,89 @@ def surfaces(
         if colors is not None and colors.ndim == 1:
             colors = signed_colors(colors, limit)
         X, T = as_arrays(mesh)
-        drawn = render(
+        pixels = render(
             X, T, colors=colors, flat=flat, view=view, up=up, size=(360, 300), frame=frame
         )
-        ax.imshow(drawn)
+        ax.imshow(pixels)
         ax.set_title(title, parse_math=False)
     if signed:
         scale = ScalarMappable(Normalize(-limit, limit), SIGNED)
         bar = figure.colorbar(scale, ax=axes, shrink=0.7, label=label, pad=0.01)
-        if not any((array < 0).any() for array in signed):  # errors: the half that they can have
+        if not any((array < 0).any() for array in signed):  # such as errors
             bar.ax.set_ylim(0, limit)
     return figure
 
 
-def brief(names: list[str], room: int = 16) -> list[str]:
-    """Names as short as they can be told apart.
-
-    What all share at both ends is left out where one is long.
+def shortened(names: list[str], length: int = 16) -> list[str]:
+    """Shorten names that are too long, and omit their common prefix and suffix.
 
     Examples
     --------
-    >>> from s4a.show.charts import brief
-    >>> brief(["brain_01", "brain_02"])
+    >>> from s4a.show.charts import shortened
+    >>> shortened(["brain_01", "brain_02"])
     ['brain_01', 'brain_02']
-    >>> brief(["subject_0001_left_hippocampus", "subject_0020_left_hippocampus"])
+    >>> shortened(["subject_0001_left_hippocampus", "subject_0020_left_hippocampus"])
     ['…0001…', '…0020…']
     """
-    if max(map(len, names), default=0) <= room:
+    if max(map(len, names), default=0) <= length:
         return list(names)
 
-    def shared(texts):
-        """Length of what all texts begin with, up to a separator."""
+    def common(texts):
+        """Return the length of the common prefix up to a separator."""
         first, last = min(texts), max(texts)
         same = (i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b)
         return len(re.findall(r"\A(?:.*[_\W])?", first[: next(same, len(first))], re.DOTALL)[0])
 
-    start = shared(names)
-    stop = shared([name[start:][::-1] for name in names])
+    start = common(names)
+    stop = common([name[start:][::-1] for name in names])
     left, right = "…" * (start > 0), "…" * (stop > 0)
-    told = [left + name[start : len(name) - stop] + right for name in names]
-    half = room // 2
-    return [name if len(name) <= room else f"{name[: half - 1]}…{name[-half:]}" for name in told]
+    cut = [left + name[start : len(name) - stop] + right for name in names]
+    half = length // 2
+    return [name if len(name) <= length else f"{name[: half - 1]}…{name[-half:]}" for name in cut]
 
 
-def _free_corner(box, size, room, taken, outward):
-    """Where a name of a `size` in points is written beside its point: offsets right and up.
+def _free_corner(point, size, limits, taken, outward):
+    """Return offsets right and up, in points, for a label of a `size` next to its point.
 
-    Four corners are tried, those first that lie `outward`, where fewer lines end::
+    Four corners are tried, first those in the direction `outward`, where fewer edges end::
 
-        2 | 1     None if each leaves the `room` from left to right, or lies over a box that
-        --+--     is taken.
+        2 | 1     None if a label in each of them exceeds the horizontal `limits` or overlaps
+        --+--     a box in `taken`.
         4 | 3
     """
-    x, y = box
-    wide, high = size
-    corners = ((3, 3), (-3 - wide, 3), (3, -3 - high), (-3 - wide, -3 - high))
+    x, y = point
+    width, height = size
+    corners = ((3, 3), (-3 - width, 3), (3, -3 - height), (-3 - width, -3 - height))
     for right, up in sorted(corners, key=lambda corner: -np.sign(corner) @ outward):
         low, bottom = x + right, y + up
-        clear = (taken[:, 2] < low) | (low + wide < taken[:, 0])
-        clear |= (taken[:, 3] < bottom) | (bottom + high < taken[:, 1])
-        if room[0] <= low and low + wide <= room[1] and clear.all():
+        clear = (taken[:, 2] < low) | (low + width < taken[:, 0])
+        clear |= (taken[:, 3] < bottom) | (bottom + height < taken[:, 1])
+        if limits[0] <= low and low + width <= limits[1] and clear.all():
             return right, up
     return None
 
 
-def _names(ax, places, names):
-    """Names beside their points, each where it hides no other, or not at all."""
+def _names(ax, positions, names):
+    """Write names next to their points where they overlap nothing, and omit the others."""
     size = 8 if len(names) <= 12 else 6
     inches = ax.figure.get_size_inches() / [len(ax.figure.axes), 1]
-    width, height = 72 * inches  # in points, as fonts are
-    span = np.ptp(places, axis=0)
-    at = (places - places.min(0)) / np.where(span > 0, span, 1) * 0.68 * [width, height]
-    room = -0.06 * width, 0.74 * width
+    width, height = 72 * inches  # in points, like fonts
+    span = np.ptp(positions, axis=0)
+    at = (positions - positions.min(0)) / np.where(span > 0, span, 1) * 0.68 * [width, height]
+    limits = -0.06 * width, 0.74 * width
     taken = np.concatenate([at - 3, at + 3], axis=1)  # left, bottom, right, top
-    for i, name in enumerate(brief(names)):
-        wide = 0.58 * size * len(name)
-        others = np.delete(taken, i, axis=0)  # its own point may touch it
-        offset = _free_corner(at[i], (wide, size), room, others, at[i] - at.mean(0))
+    for i, name in enumerate(shortened(names)):
+        label = np.array([0.58 * size * len(name), size])
+        others = np.delete(taken, i, axis=0)  # a label may touch its own point
+        offset = _free_corner(at[i], label, limits, others, at[i] - at.mean(0))
         if offset is None:
             continue
         corner = at[i] + offset
-        taken = np.vstack([taken, [*corner, *(corner + [wide, size])]])
+        taken = np.vstack([taken, [*corner, *(corner + label)]])
         right, up = offset
         ax.annotate(
             name,
-            places[i],
+            positions[i],
             (np.copysign(3, right), up),
             textcoords="offset points",
             ha="left" if right > 0 else "right",
@@ -243,12 +245,12 @@ def _names(ax, places, names):
             color="#333333",
             zorder=4,
             parse_math=False,
-            path_effects=[withStroke(linewidth=2, foreground="white")],  # over lines
+            path_effects=[withStroke(linewidth=2, foreground="white")],  # over edges
         )
 
 
 def network(
-    places: np.ndarray,
+    positions: np.ndarray,
     names: list[str],
     source: np.ndarray,
     target: np.ndarray,
@@ -257,21 +259,22 @@ def network(
     *,
     limits: tuple[float, float] | None = None,
 ) -> Figure:
-    """The graph of maps, once for each named array of edge errors, on one logarithmic scale.
+    """Draw the network of maps once for each array of edge errors, on one logarithmic scale.
 
     Parameters
     ----------
-    places : float ndarray (shape, 2)
+    positions : float ndarray (shape, 2)
+        Positions of the nodes.
     names : sequence of str
     source, target : int ndarray (pair,)
-        Which shape each map takes and gives.
+        Source and target node of each map.
     errors : dict of str to float ndarray (pair,)
-        Title of each picture and the value that colours its edges, grey where it is NaN.
+        Title of each picture, and the errors that colour its edges; NaN is grey.
     highlight : int, optional
-        The shape to mark.
+        Index of a node to mark.
     limits : (float, float), optional
-        Smallest and largest error of the scale, see :func:`s4a.show.draw.cycle_error_limits`; by
-        default those of all `errors`.
+        Ends of the scale (:func:`s4a.show.draw.cycle_error_limits`); by default those of all
+        `errors`.
 
     Returns
     -------
@@ -288,16 +291,16 @@ def network(
     """
     figure, (axes,) = _figure(4.6 * len(errors) + 0.6, 4.2, len(errors))
     limits = limits or cycle_error_limits(*errors.values())
-    lines = np.stack([places[source], places[target]], axis=1)  # (pair, 2, 2)
+    edges = np.stack([positions[source], positions[target]], axis=1)  # (pair, 2, 2)
     for ax, (title, value) in zip(axes, errors.items(), strict=True):
-        order = np.argsort(np.nan_to_num(value, nan=-1))  # the worst on top, the unknown below
+        order = np.argsort(np.nan_to_num(value, nan=-1))  # the largest on top, unknown below
         colors = cycle_error_colors(value[order], limits)
-        ax.add_collection(LineCollection(list(lines[order]), colors=list(colors), linewidths=1.2))
-        ax.scatter(*places.T, s=22, color="#333333", zorder=2)
+        ax.add_collection(LineCollection(list(edges[order]), colors=list(colors), linewidths=1.2))
+        ax.scatter(*positions.T, s=22, color="#333333", zorder=2)
         if highlight is not None:
             ring = {"facecolor": "none", "edgecolor": ORANGE, "linewidth": 2}
-            ax.scatter(*places[highlight], s=90, zorder=3, **ring)
-        _names(ax, places, names)
+            ax.scatter(*positions[highlight], s=90, zorder=3, **ring)
+        _names(ax, positions, names)
         if np.isfinite(value).any():
             title = f"{title}, median {np.nanmedian(value):.3g}"
         ax.set_title(title)
@@ -317,16 +320,16 @@ def matrices(
     *,
     axes: tuple[str, str] = ("eigenfunction of the source", "eigenfunction of the target"),
 ) -> Figure:
-    """Matrices side by side with signed colours, blue positive.
+    """Draw matrices side by side with signed colours, blue positive.
 
     Parameters
     ----------
     named : dict of str to float ndarray (rows, columns)
-        Title of each matrix and its numbers.
+        Title of each matrix and its entries.
     limit : float
-        The largest absolute number of the scale.
+        Absolute value at the ends of the scale.
     axes : (str, str)
-        What is along the columns, and along the rows.
+        Labels of the columns and of the rows.
 
     Returns
     -------
@@ -336,8 +339,8 @@ def matrices(
     --------
     >>> import numpy as np
     >>> from s4a.show.charts import matrices
-    >>> turn = np.linalg.qr(np.random.default_rng(0).normal(size=(20, 20)))[0]
-    >>> matrices({"identity": np.eye(20), "a rotation": turn})
+    >>> Q = np.linalg.qr(np.random.default_rng(0).normal(size=(20, 20)))[0]
+    >>> matrices({"identity": np.eye(20), "orthogonal": Q})
     <Figure ...>
     """
     figure, (frames,) = _figure(3.4 * len(named) + 0.7, 3.3, len(named))
@@ -353,7 +356,7 @@ def matrices(
 def ranked(
     names: list[str], values: np.ndarray, label: str, highlight: int | None = None
 ) -> Figure:
-    """Bars in rising order; `highlight` is the index of a shape to mark.
+    """Draw bars in ascending order; `highlight` is the index of a shape to mark.
 
     Examples
     --------
@@ -364,10 +367,10 @@ def ranked(
     """
     order = np.argsort(values)
     figure, ((ax,),) = _figure(7.5, max(1.4, 0.5 + 0.17 * len(values)))
-    place = np.arange(len(order))
+    y = np.arange(len(order))
     colors = np.where(order == highlight, ORANGE, BLUE)
-    ax.barh(place, values[order], color=colors, height=0.75)
-    ax.set_yticks(place, np.array(brief(names), object)[order], fontsize=7, parse_math=False)
+    ax.barh(y, values[order], color=colors, height=0.75)
+    ax.set_yticks(y, np.array(shortened(names), object)[order], fontsize=7, parse_math=False)
     ax.invert_yaxis()
     ax.margins(y=0.01)
     ax.set_xlabel(label)
@@ -375,7 +378,7 @@ def ranked(
 
 
 def stacked(names: list[str], parts: list[str], seconds: np.ndarray) -> Figure:
-    """Bars of seconds stacked by part, one for each name, the total at their end (Fig. 3).
+    """Draw a stacked bar of seconds for each name, with the total at its end (Fig. 3).
 
     Parameters
     ----------
@@ -385,19 +388,19 @@ def stacked(names: list[str], parts: list[str], seconds: np.ndarray) -> Figure:
     Examples
     --------
     >>> from s4a.show.charts import stacked
-    >>> stacked(["one way", "another"], ["maps", "matches"], [[3.0, 1.0], [1.0, 2.0]])
+    >>> stacked(["method A", "method B"], ["maps", "matches"], [[3.0, 1.0], [1.0, 2.0]])
     <Figure ...>
     """
     figure, ((ax,),) = _figure(8, 0.45 * len(names) + 1.4)
-    places, left = np.arange(len(names)), np.zeros(len(names))
+    y, left = np.arange(len(names)), np.zeros(len(names))
     for i, (part, length) in enumerate(zip(parts, np.transpose(seconds), strict=True)):
         color = PART_COLORS[i % len(PART_COLORS)]
-        ax.barh(places, length, left=left, height=0.65, label=part, color=color)
+        ax.barh(y, length, left=left, height=0.65, label=part, color=color)
         left = left + length
-    beside = {"textcoords": "offset points", "va": "center", "fontsize": 8}
-    for place, total in enumerate(left):
-        ax.annotate(f"{total:.3g} s", (total, place), (4, 0), **beside)
-    ax.set_yticks(places, names, parse_math=False)
+    options = {"textcoords": "offset points", "va": "center", "fontsize": 8}
+    for i, total in enumerate(left):
+        ax.annotate(f"{total:.3g} s", (total, i), (4, 0), **options)
+    ax.set_yticks(y, names, parse_math=False)
     ax.invert_yaxis()
     ax.set(xlabel="CPU time (s)", xlim=(0, 1.12 * left.max(initial=0) or 1))
     figure.legend(loc="outside lower center", ncols=4, frameon=False)
@@ -405,7 +408,7 @@ def stacked(names: list[str], parts: list[str], seconds: np.ndarray) -> Figure:
 
 
 def variance(high: np.ndarray | list[Any], low: np.ndarray | list[Any] | None = None) -> Figure:
-    """Cumulative share of variance over the number of components, at both resolutions (Fig. 5).
+    """Draw the cumulative explained variance at both resolutions (Fig. 5).
 
     Examples
     --------
@@ -414,7 +417,7 @@ def variance(high: np.ndarray | list[Any], low: np.ndarray | list[Any] | None = 
     <Figure ...>
     """
     figure, ((ax,),) = _figure(5.2, 3.2)
-    curves = (  # rings around dots: both are seen where they agree
+    curves = (  # rings around dots: both are visible where they agree
         (low, "low resolution", ORANGE, {"ms": 8, "mfc": "none"}),
         (high, "high resolution", BLUE, {"ms": 4}),
     )
@@ -423,7 +426,7 @@ def variance(high: np.ndarray | list[Any], low: np.ndarray | list[Any] | None = 
             share = np.cumsum(np.asarray(values)[:20])
             count = np.arange(1, len(share) + 1)
             ax.plot(count, share, "o-", color=color, label=label, **marker)
-    ax.set(xlabel="number of components", ylabel="explained variance", ylim=(0, 1.03))
+    ax.set(xlabel="number of modes", ylabel="explained variance", ylim=(0, 1.03))
     ax.yaxis.set_major_formatter(PercentFormatter(1))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.grid(axis="y", color="#dddddd")
@@ -437,9 +440,9 @@ def scores(
     highlight: int | None = None,
     faint: Sequence[bool] | None = None,
 ) -> Figure:
-    """Scores of the shapes on the first components, two by two, in standard deviations.
+    """Draw the scores of the shapes on the first modes of variation, in standard deviations.
 
-    Those that are `faint` are grey.
+    Shapes that are `faint` are grey.
 
     Examples
     --------
@@ -458,13 +461,13 @@ def scores(
         ax.axvline(0, color="#dddddd", lw=1)
         ax.scatter(score[:, a], score[:, b], color=colors, s=20, zorder=2)
         _names(ax, score[:, [a, b]], names)
-        ax.set(xlabel=f"component {a + 1} (sd)", ylabel=f"component {b + 1} (sd)")
+        ax.set(xlabel=f"PC{a + 1} (sd)", ylabel=f"PC{b + 1} (sd)")
         ax.margins(0.12)
     return figure
 
 
 def color_bar(colormap: str | Colormap, low: float, high: float, label: str) -> Figure:
-    """A horizontal colour bar.
+    """Draw a horizontal colour bar.
 
     Examples
     --------

@@ -1,7 +1,4 @@
-"""Pictures of surfaces without a graphics card.
-
-A small renderer in NumPy, and the colours that S4A uses.
-"""
+"""A small software renderer of surfaces in NumPy, and the colours of S4A."""
 
 import base64
 import io
@@ -28,29 +25,29 @@ VIEWS = {
 }
 CLAY = (0.80, 0.76, 0.70)
 UNKNOWN = (0.6, 0.6, 0.6)
-# Okabe and Ito's colours, told apart with every common kind of colour blindness
+# Okabe and Ito's colours, distinguishable with all common kinds of colour blindness
 OKABE_ITO = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7", "#999999")
-# red, white, blue, without the ends, which are too dark to show the shading
+# red, white, blue, without the ends, which are too dark for shading
 SIGNED = ListedColormap(colormaps["RdBu"](np.linspace(0.06, 0.94, 255)), "signed")
-# cycle errors, small to large: without viridis' bright end, which is hard to see on white
+# cycle errors, small to large: viridis without its bright end, which is hard to see on white
 CYCLE_ERROR = ListedColormap(
     colormaps["viridis_r"](np.linspace(0.15, 1, 256)), "cycle_error"
 ).with_extremes(bad="#bbbbbb")
-SPREAD = 2, 100  # largest cycle error of the scale by the smallest: at least and at most
-LASSO = 600  # samples along the picture in which hidden vertices are found
-CHUNK = 2_000_000  # candidate samples at a time, some 100 MB
+RATIO = 2, 100  # smallest and largest ratio of the ends of the scale of cycle errors
+LASSO = 600  # samples along the picture that decides which vertices are hidden
+CHUNK = 2_000_000  # candidate samples at a time, about 100 MB
 
 
 def rotation(view: Viewpoint = "corner", up: str = "z") -> np.ndarray:
-    """Rotation ``(3, 3)`` into the picture: rows right, up and towards the viewer.
+    """Return the rotation ``(3, 3)`` into the picture: rows right, up and towards the viewer.
 
     Parameters
     ----------
     view : str or (float, float)
-        A name of :data:`VIEWS`, or where the viewer stands: azimuth around the up axis and
-        elevation, in degrees.
+        A name of :data:`VIEWS`, or the viewer's azimuth around the up axis and elevation, in
+        degrees.
     up : {"x", "y", "z"}
-        The axis that points up; the other two follow it in cyclic order.
+        The axis that points up; the other two follow in cyclic order.
 
     Examples
     --------
@@ -68,9 +65,7 @@ def rotation(view: Viewpoint = "corner", up: str = "z") -> np.ndarray:
 
 
 def opposite(view: Viewpoint) -> tuple[float, float]:
-    """The view from the other side, as azimuth and elevation.
-
-    The two together show all that can be seen.
+    """Return the view from the opposite side, as azimuth and elevation.
 
     Examples
     --------
@@ -93,7 +88,7 @@ def _angles(view):
 def rasterise(
     P: np.ndarray, T: np.ndarray, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Which triangle each sample of the picture sees, by a z-buffer.
+    """Return the visible triangle of each sample of the picture, by a z-buffer.
 
     Parameters
     ----------
@@ -105,14 +100,14 @@ def rasterise(
     Returns
     -------
     sample : int ndarray (s,)
-        The samples ``y * width + x`` that see something.
+        The covered samples, as ``y * width + x``.
     triangle : int ndarray (s,)
     weights : float32 ndarray (s, 3)
         Barycentric weights in that triangle.
     depth : float32 ndarray (s,)
     """
     corners = P[T][..., :2]  # (m, 3, 2)
-    # the box of the samples whose middles may lie in the triangle
+    # the box of the samples whose centres may lie in the triangle
     low = np.maximum(np.ceil(corners.min(1) - 0.5), 0).astype(np.int64)
     high = np.floor(corners.max(1) - 0.5)
     high = np.minimum(high, (width - 1, height - 1)).astype(np.int64)
@@ -130,8 +125,8 @@ def rasterise(
     for part in np.split(drawn, np.searchsorted(total, ends)):
         count = samples[part]
         owner = np.repeat(part, count)  # the triangle of each sample of its box
-        place = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
-        dy, dx = np.divmod(place, box[owner, 0])
+        index = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)  # in the box
+        dy, dx = np.divmod(index, box[owner, 0])
         wb = start[owner, 0] + slopes[owner, 0] * dx + slopes[owner, 1] * dy
         wc = start[owner, 1] + slopes[owner, 2] * dx + slopes[owner, 3] * dy
         inside = np.flatnonzero((wb >= 0) & (wc >= 0) & (wb + wc <= 1))
@@ -147,23 +142,23 @@ def rasterise(
 
 
 def vertices_within(
-    X: np.ndarray, T: np.ndarray, polygon: np.ndarray | list[Any], turn: np.ndarray
+    X: np.ndarray, T: np.ndarray, polygon: np.ndarray | list[Any], rotation: np.ndarray
 ) -> np.ndarray:
-    """The vertices that are seen within a polygon of the picture's plane.
+    """Return the visible vertices inside a polygon in the picture's plane.
 
     Parameters
     ----------
     X : float ndarray (n, 3)
     T : int ndarray (m, 3)
     polygon : float ndarray (q, 2)
-        In the plane of the view, x to the right and y up, in the unit of X.
-    turn : float ndarray (3, 3)
+        In the plane of the view, x right and y up, in the unit of X.
+    rotation : float ndarray (3, 3)
         The rotation of the view, its rows x, y and towards the viewer.
 
     Returns
     -------
     bool ndarray (n,)
-        Not those that face away, nor those that lie behind others.
+        True for vertices inside that face the viewer and are not hidden.
 
     Examples
     --------
@@ -173,30 +168,30 @@ def vertices_within(
     >>> from s4a.show.draw import vertices_within
     >>> X, T = as_arrays(s4a.synthetic.sphere(2000))
     >>> square = [[0, 0], [2, 0], [2, 2], [0, 2]]
-    >>> found = X[vertices_within(X, T, square, np.eye(3))]
-    >>> bool((found > -0.01).all()), round(len(found) / len(X), 2)
+    >>> inside = X[vertices_within(X, T, square, np.eye(3))]
+    >>> bool((inside > -0.01).all()), round(len(inside) / len(X), 2)
     (True, 0.12)
     """
-    P = X @ np.reshape(turn, (3, 3)).T
+    P = X @ np.reshape(rotation, (3, 3)).T
     low, reach = P[:, :2].min(0), np.ptp(P[:, :2], axis=0).max()
     screen = np.c_[(P[:, :2] - low) * (LASSO - 1) / reach, P[:, 2]]
     sample, _, _, depth = rasterise(screen, T, LASSO, LASSO)
     front = np.full(LASSO * LASSO, -np.inf)
     front[sample] = depth
-    column, line = screen[:, :2].astype(int).T
-    seen = P[:, 2] >= front[line * LASSO + column] - 0.01 * reach
+    column, row = screen[:, :2].astype(int).T
+    visible = P[:, 2] >= front[row * LASSO + column] - 0.01 * reach
     facing = vertex_normals(P, T)[:, 2] > 0
-    return seen & facing & Path(polygon).contains_points(P[:, :2])
+    return visible & facing & Path(polygon).contains_points(P[:, :2])
 
 
 def _weight_planes(corners, low):
-    """The weights of corners b and c, which are linear in the sample's place.
+    """Return the barycentric weights of corners b and c as linear functions of the position.
 
     Returns
     -------
     double_area : float ndarray (m,), signed
     slopes : float32 ndarray (m, 4)
-        Of the weight of b along x and y, and of that of c.
+        Derivatives of the weight of b by x and y, and of the weight of c.
     start : float32 ndarray (m, 2)
         Both weights at the first sample of the box.
     """
@@ -212,10 +207,7 @@ def _weight_planes(corners, low):
 
 
 def plane_box(points: np.ndarray, view: Viewpoint = "corner", up: str = "z") -> np.ndarray:
-    """The box ``(2, 2)`` of the points in the picture's plane, lowest and highest corner.
-
-    A `frame` for render.
-    """
+    """Return the bounding box ``(2, 2)`` of points in the picture's plane, for `render`."""
     plane = np.asarray(points, float).reshape(-1, 3) @ rotation(view, up)[:2].T
     return np.stack([plane.min(0), plane.max(0)])
 
@@ -231,7 +223,7 @@ def render(
     size: tuple[int, int] = (500, 400),
     frame: np.ndarray | None = None,
 ) -> np.ndarray:
-    """A picture of a surface: orthographic, softly lit, antialiased, on a transparent background.
+    """Render a surface: orthographic, softly lit, antialiased, on a transparent background.
 
     Parameters
     ----------
@@ -239,16 +231,16 @@ def render(
     triangles : int ndarray (m, 3)
     colors : float ndarray (n, 3), optional
         Red, green and blue of each vertex, 0 to 1; see :func:`signed_colors`, :func:`ramp_colors`
-        and :func:`label_colors`.  A row of NaN is drawn grey.
+        and :func:`label_colors`.  A row of NaN is grey.
     flat : bool
-        Take the colour of the nearest corner instead of mixing three: for labels.
+        Use the colour of the nearest corner, without interpolation: for labels.
     view, up
         See :func:`rotation`.
     size : (int, int)
         Width and height in pixels.
     frame : float ndarray (2, 2), optional
-        What part of the picture's plane to show, as :func:`plane_box` gives it, so that several
-        pictures share a scale; by default the surface fills the picture.
+        The part of the picture's plane to show (:func:`plane_box`), so that several pictures have
+        one scale; by default the surface fills the picture.
 
     Returns
     -------
@@ -258,7 +250,12 @@ def render(
     Raises
     ------
     ValueError
-        For an empty surface, or positions that are not finite.
+        If the surface is empty, or a position is not finite.
+
+    See Also
+    --------
+    s4a.write_picture : a picture file of a study or a mesh.
+    s4a.show.charts.surfaces : several surfaces with titles and a colour bar.
 
     Examples
     --------
@@ -287,7 +284,7 @@ def render(
     sample, triangle, weights, depth = rasterise(P, T, width, height)
     corners = T[triangle]  # (s, 3)
     N = np.einsum("sc,scx->sx", weights, vertex_normals(X, T).astype(np.float32)[corners])
-    # a surface seen from behind is lit all the same
+    # a surface is also lit from behind
     N *= np.where(triangle_normals(X, T)[triangle, 2:] < 0, -1, 1)
     N /= np.maximum(np.linalg.norm(N, axis=1, keepdims=True), 1e-6)
     base = np.asarray(CLAY, np.float32)
@@ -302,7 +299,7 @@ def render(
 
 
 def _sampled(colors, corners, weights, flat):
-    """The colour of every sample from the colours of the corners of its triangle."""
+    """Interpolate the colours of the corners at every sample."""
     colors = np.asarray(colors, np.float32)
     colors = np.where(np.isfinite(colors), colors, np.array(UNKNOWN, np.float32))
     if flat:
@@ -311,9 +308,9 @@ def _sampled(colors, corners, weights, flat):
 
 
 def _creases(sample, depth, width, height):
-    """Darkness ``(s,)`` of samples that lie deeper than what is around them.
+    """Return the darkness ``(s,)`` of samples that are deeper than their surroundings.
 
-    An unsharp mask of the depth.
+    This is an unsharp mask of the depth.
     """
     flat = np.zeros((2, height * width), np.float32)
     flat[0, sample], flat[1, sample] = depth, 1
@@ -326,26 +323,26 @@ def _creases(sample, depth, width, height):
 
 
 def _halved(samples):
-    """The mean of each two by two samples."""
+    """Return the mean of each two by two samples."""
     return (samples[::2, ::2] + samples[1::2, ::2] + samples[::2, 1::2] + samples[1::2, 1::2]) / 4
 
 
 def _light(N, base, crease):
-    """Colours ``(s, 3)`` under a key light from the upper left, a soft sky and a little gloss."""
+    """Return colours ``(s, 3)`` under a key light from the upper left, a soft sky and gloss."""
     key = np.array([-0.42, 0.55, 0.72], np.float32)
     key /= np.linalg.norm(key)
     gloss = key + [0, 0, 1]
     gloss = (gloss / np.linalg.norm(gloss)).astype(np.float32)
     wrap = np.clip((N @ key + 0.3) / 1.3, 0, 1)
     sky = 0.5 + 0.5 * N[:, 1]
-    boundary = np.clip(1 - N[:, 2], 0, 1) ** 3
-    light = (0.47 + 0.15 * sky + 0.48 * wrap) * (1 - 0.5 * crease) * (1 - 0.3 * boundary)
+    silhouette = np.clip(1 - N[:, 2], 0, 1) ** 3
+    light = (0.47 + 0.15 * sky + 0.48 * wrap) * (1 - 0.5 * crease) * (1 - 0.3 * silhouette)
     shine = 0.10 * np.clip(N @ gloss, 0, 1) ** 40 * (1 - crease)
     return np.clip(base * light[:, None] + shine[:, None], 0, 1)
 
 
 def signed_colors(values: np.ndarray, limit: float) -> np.ndarray:
-    """Colours ``(n, 3)`` of signed values, white at 0.
+    """Return colours ``(n, 3)`` of signed values, white at 0.
 
     Blue is positive (expansion), red is negative (compression).
 
@@ -353,7 +350,7 @@ def signed_colors(values: np.ndarray, limit: float) -> np.ndarray:
     ----------
     values : float ndarray (n,)
     limit : float
-        The absolute value of the full colours.
+        The absolute value at the ends of the colour scale.
 
     Examples
     --------
@@ -372,7 +369,10 @@ def ramp_colors(
     high: float | None = None,
     colormap: str | Colormap = "viridis",
 ) -> np.ndarray:
-    """Colours ``(n, 3)`` of values from `low` to `high` (by default their range); NaN stays NaN."""
+    """Return colours ``(n, 3)`` of values from `low` to `high`, by default their range.
+
+    NaN stays NaN.
+    """
     values = np.asarray(values, float)
     low = np.nanmin(values) if low is None else low
     high = np.nanmax(values) if high is None else high
@@ -382,9 +382,7 @@ def ramp_colors(
 
 
 def label_colors(labels: np.ndarray) -> np.ndarray:
-    """Colours ``(n, 3)`` of integer labels.
-
-    Eight that everybody tells apart, then darker and lighter ones of them.
+    """Return colours ``(n, 3)`` of integer labels: Okabe and Ito's, then darker and lighter ones.
 
     Examples
     --------
@@ -396,31 +394,31 @@ def label_colors(labels: np.ndarray) -> np.ndarray:
     >>> brain = s4a.synthetic.brains(1, 3000)["original/brain_01"].to_dataset()
     >>> colors = {"regions": label_colors(brain["label"].values)}
     >>> s4a.show.charts.surfaces({"regions": brain}, colors, flat=True)
-    <Parts ...>
+    <TiledFigure ...>
     """
     palette = np.array([to_rgb(color) for color in OKABE_ITO])
     palette = np.concatenate([palette, 0.55 * palette, 0.45 + 0.55 * palette])
-    _, place = np.unique(labels, return_inverse=True)
-    return palette[place.reshape(np.shape(labels)) % len(palette)]
+    _, index = np.unique(labels, return_inverse=True)
+    return palette[index.reshape(np.shape(labels)) % len(palette)]
 
 
 def cycle_error_limits(*errors: np.ndarray) -> tuple[float, float]:
-    """Smallest and largest cycle error of the colour scale, from the errors of all stages.
+    """Return the ends of the colour scale of cycle errors, from the errors of all stages.
 
-    One scale for a study, whatever of it is shown: maps before and after Consistent ZoomOut can be
-    compared, and an error has the same colour in a panel, a chart and a scene.
+    A study has one scale: maps before and after Consistent ZoomOut can be compared, and an error
+    has the same colour in panels, charts and scenes.
 
     Parameters
     ----------
     *errors : float ndarray (pair,)
-        Of each stage; NaN for maps in no cycle.
+        Errors of each stage; NaN for maps in no cycle.
 
     Returns
     -------
     (float, float)
-        From the smallest to the largest error that is known, but at least a factor of 2, so that
-        maps that are equally good look so, and at most a factor of 100: smaller errors have the
-        colour of the smallest.  (0.5, 1) where all errors are 0 or unknown.
+        Smallest and largest known error, with a ratio of at least 2, so that similar errors have
+        similar colours, and at most 100: smaller errors have the colour of the lower end.
+        (0.5, 1) if all errors are 0 or unknown.
 
     Examples
     --------
@@ -433,19 +431,19 @@ def cycle_error_limits(*errors: np.ndarray) -> tuple[float, float]:
     """
     known = np.concatenate([np.ravel(values)[np.isfinite(np.ravel(values))] for values in errors])
     high = float(known.max(initial=0)) or 1.0
-    least, most = SPREAD
-    return float(np.clip(known.min(initial=high), high / most, high / least)), high
+    smallest, largest = RATIO
+    return float(np.clip(known.min(initial=high), high / largest, high / smallest)), high
 
 
 def cycle_error_colors(errors: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
-    """Colours ``(pair, 3)`` of cycle errors, yellow-green to violet: equal steps, equal ratios.
+    """Return colours ``(pair, 3)`` of cycle errors on a logarithmic scale, yellow-green to violet.
 
     Parameters
     ----------
     errors : float ndarray (pair,)
-        What is NaN, for maps in no cycle, is grey.
+        NaN, for maps in no cycle, is grey.
     limits : (float, float)
-        Of :func:`cycle_error_limits`.
+        Result of :func:`cycle_error_limits`.
 
     Examples
     --------
@@ -461,18 +459,18 @@ def cycle_error_colors(errors: np.ndarray, limits: tuple[float, float]) -> np.nd
 
 
 def position_colors(points: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
-    """Colours ``(n, 3)`` that tell places apart: the coordinates as red, green and blue.
+    """Return colours ``(n, 3)`` of positions: the coordinates as red, green and blue.
 
-    Of places near a surface the colours are those of its points ``among``; NaN stays NaN.
+    The scale is that of the points `among`, by default the points themselves; NaN stays NaN.
 
     Examples
     --------
     >>> import s4a
     >>> from s4a.show.draw import position_colors
     >>> ball = s4a.synthetic.sphere(2000)
-    >>> colors = {"places": position_colors(ball["position"].values)}
-    >>> s4a.show.charts.surfaces({"places": ball}, colors)
-    <Parts ...>
+    >>> colors = {"positions": position_colors(ball["position"].values)}
+    >>> s4a.show.charts.surfaces({"positions": ball}, colors)
+    <TiledFigure ...>
     """
     points = np.asarray(points, float)
     box = points if among is None else np.asarray(among, float)
@@ -481,7 +479,7 @@ def position_colors(points: np.ndarray, among: np.ndarray | None = None) -> np.n
 
 
 def checkerboard(coordinates: np.ndarray, cell: float) -> np.ndarray:
-    """Brightness ``(n,)`` of a checkerboard of cubes of the side `cell`: 1 and 0.5 in turn.
+    """Return the brightness ``(n,)`` of a checkerboard of cubes of side `cell`: 1 or 0.5.
 
     NaN stays NaN.
 
@@ -495,7 +493,7 @@ def checkerboard(coordinates: np.ndarray, cell: float) -> np.ndarray:
     >>> ball = s4a.synthetic.sphere(30_000)
     >>> grey = checkerboard(ball["position"].values, 0.4)[:, None] * np.ones(3)
     >>> s4a.show.charts.surfaces({"cubes of 0.4": ball}, {"cubes of 0.4": grey})
-    <Parts ...>
+    <TiledFigure ...>
     """
     return 1 - 0.5 * (np.floor(np.asarray(coordinates) / cell).sum(1) % 2)
 
@@ -503,9 +501,9 @@ def checkerboard(coordinates: np.ndarray, cell: float) -> np.ndarray:
 def with_balls(
     points: np.ndarray, triangles: np.ndarray, colors: np.ndarray | None, balls: list[list[float]]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """A surface with spheres: points, triangles and colours of all.
+    """Add spheres to a surface: return points, triangles and colours of both.
 
-    Each ball is x, y, z, red, green, blue, radius.
+    A ball is x, y, z, red, green, blue, radius.
 
     Examples
     --------
@@ -523,10 +521,10 @@ def with_balls(
     a, b = np.meshgrid(polar, azimuth, indexing="ij")
     unit = np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], -1).reshape(-1, 3)
     # two triangles of each patch between two rings
-    here = (np.arange(rings)[:, None] * (around + 1) + np.arange(around)).ravel()
-    below = here + around + 1
+    above = (np.arange(rings)[:, None] * (around + 1) + np.arange(around)).ravel()
+    below = above + around + 1
     T = np.concatenate([
-        np.stack([here, below, here + 1], 1), np.stack([here + 1, below, below + 1], 1)
+        np.stack([above, below, above + 1], 1), np.stack([above + 1, below, below + 1], 1)
     ])  # fmt: skip
     table = np.asarray(balls, float)  # (ball, 7)
     centre, color, radius = table[:, None, :3], table[:, 3:6], table[:, 6, None, None]
@@ -541,9 +539,7 @@ def with_balls(
 
 
 def image_bytes(picture: np.ndarray, kind: str = "webp") -> bytes:
-    """The bytes of an image file of a picture ``(height, width, 4)``.
-
-    ``webp``, a tenth of the size, or exact ``png``.
+    """Return a picture ``(height, width, 4)`` as an image file: small ``webp`` or exact ``png``.
 
     Examples
     --------
@@ -558,11 +554,11 @@ def image_bytes(picture: np.ndarray, kind: str = "webp") -> bytes:
 
 
 def on_white(picture: np.ndarray) -> np.ndarray:
-    """A picture ``(height, width, 4)`` laid on white: ``(height, width, 3)``."""
+    """Blend a picture ``(height, width, 4)`` with white to ``(height, width, 3)``."""
     opacity = picture[..., 3:] / 255
     return (picture[..., :3] * opacity + 255 * (1 - opacity) + 0.5).astype(np.uint8)
 
 
 def data_uri(content: bytes, kind: str = "image/webp") -> str:
-    """Bytes as the address of an image inside a page."""
+    """Return bytes as a data URI for a page."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"

@@ -11,7 +11,7 @@ from s4a.input.plausibility import decisions, notices
 from s4a.options import kept_options
 from s4a.schema import check_type
 from s4a.show import charts
-from s4a.show.browser import MODES, PARTS, TEMPLATES, look_state, mesh_state, webp_uri
+from s4a.show.browser import MODES, PARTS, TEMPLATES, appearance_state, mesh_state, webp_uri
 from s4a.show.draw import SIGNED, Viewpoint, opposite, position_colors, ramp_colors, render
 from s4a.show.pictures import N_MODES, PANEL, SIGMA, mode_pictures, shared_frames
 from s4a.show.surfaces import (
@@ -32,8 +32,8 @@ from s4a.show.surfaces import (
 )
 from s4a.study.tree import left_out, seconds_of
 
-LARGE = 20_000  # vertices from which a page moves the low-resolution mesh
-N_TRANSFERRED = 5  # shapes to which the template's colours are carried
+LARGE = 20_000  # vertices above which a page deforms the low-resolution mesh
+N_TRANSFERRED = 5  # shapes to which the template's colours are transferred
 
 
 def write_page(
@@ -44,9 +44,9 @@ def write_page(
     view: Viewpoint = "corner",
     up: str = "z",
 ) -> Path:
-    """Write a study as one HTML page, which needs no network and no other file.
+    """Write a study as one self-contained HTML page.
 
-    What the run has not computed is said in its place and the rest is shown.
+    A section whose data are missing says what is missing.
 
     Parameters
     ----------
@@ -55,11 +55,16 @@ def write_page(
         The file to write.
     title : str
     view, up
-        From where surfaces are seen, and which axis points up; see :func:`s4a.show.draw.rotation`.
+        Direction of view, and the axis that points up; see :func:`s4a.show.draw.rotation`.
 
     Returns
     -------
     pathlib.Path
+
+    See Also
+    --------
+    s4a.explore : the panels in a notebook.
+    s4a.write_picture, s4a.write_film : modes of variation as files.
 
     Examples
     --------
@@ -83,14 +88,14 @@ def study_html(
     view: Viewpoint = "corner",
     up: str = "z",
 ) -> str:
-    """The HTML of a study; see :func:`write_page`."""
+    """Return the HTML page of a study; see :func:`write_page`."""
     check_type(study, xr.DataTree)
     sections = []
     for heading, needs, section in SECTIONS:
         lacking = [name for name in needs if not has(study, name)]
         if lacking:
-            modes_lack = any(name.startswith("pca/") for name in lacking)
-            reason = attribute(study, "report", "no_modes") if modes_lack else ""
+            no_modes = any(name.startswith("pca/") for name in lacking)
+            reason = attribute(study, "report", "no_modes") if no_modes else ""
             sections.append((heading, PARTS.missing(lacking, reason)))
         else:
             sections.append((heading, section(study, {"view": view, "up": up})))
@@ -99,15 +104,15 @@ def study_html(
     return template.render(title=title, sections=sections, **facts)
 
 
-def _pictures(study):
-    """The place in the page of every shape's picture, by its name."""
+def _picture_ids(study):
+    """Return shape -> HTML id of its picture."""
     names = study["coarse"].children if has(study, "coarse") else ()
     return {name: f"shape-{i}" for i, name in enumerate(names)}
 
 
-def _linked(names, places):
-    """Names of shapes, as links to their pictures where there are any."""
-    return [PARTS.link(name, places[name]) if name in places else name for name in names]
+def _linked(names, ids):
+    """Return names of shapes as links to their pictures, if they have one."""
+    return [PARTS.link(name, ids[name]) if name in ids else name for name in names]
 
 
 def _index(names, name):
@@ -129,36 +134,37 @@ def _summary(study):
             facts.append(f"{key} {name}")
     if has(study, "pca/explained_variance_ratio"):
         ratio = _ratio(study)
-        facts.append(f"the first {len(ratio)} components hold {ratio.sum():.0%} of the variance")
+        facts.append(f"the first {len(ratio)} modes explain {ratio.sum():.0%} of the variance")
     if has(study, "report/seconds"):
         facts.append(seconds_of(study["report"].to_dataset()))
     return "; ".join(facts) + "." if facts else "The study is empty."
 
 
 def _warnings(study):
-    """What of the report a reader should know first: shapes left out, flagged, odd; or nothing."""
+    """Return the warnings at the top of the page: shapes left out, flagged or unusual."""
     if not has(study, "report/status"):
         return Markup("")
-    report, places = study["report"].dataset, _pictures(study)
+    report, ids = study["report"].dataset, _picture_ids(study)
     status, names = report["status"].values.astype(str), np.array(names_of(report))
-    lines = []
+    warnings = []
     if (status == "excluded").any():
-        left = _linked(names[status == "excluded"], places)
-        lines.append(("excluded", "left out, for the reasons in the table of shapes", left))
-    for kind, found in (("flagged", decisions(report)), ("odd", notices(report))):
-        for one in found:
-            lines.append((kind, f"{one.kind} ({one.remedy})", _linked(one.names, places)))
-    if not lines:
+        left = _linked(names[status == "excluded"], ids)
+        warnings.append(("excluded", "left out, for the reasons in the table of shapes", left))
+    for kind, findings in (("flagged", decisions(report)), ("odd", notices(report))):
+        for finding in findings:
+            text = f"{finding.kind} ({finding.remedy})"
+            warnings.append((kind, text, _linked(finding.names, ids)))
+    if not warnings:
         return Markup("")
-    become = "Flagged shapes are registered, and in no modes, no statistics and no median; "
-    become += "s4a run ... --include-flagged takes all of them in."
+    text = "Flagged shapes are registered, but not used for modes, statistics and the median; "
+    text += "s4a run ... --include-flagged includes them."
     if kept_options(report).get("include_flagged"):
-        become = "Flagged shapes were taken into modes and statistics by include_flagged."
-    note = PARTS.note(become) if (status == "flagged").any() else Markup("")
-    return PARTS.warnings(lines) + note
+        text = "Flagged shapes are included in modes and statistics (include_flagged)."
+    note = PARTS.note(text) if (status == "flagged").any() else Markup("")
+    return PARTS.warnings(warnings) + note
 
 
-def _shapes(study, look):
+def _shapes(study, camera):
     report = study["report"].dataset
     status = report["status"].values.astype(str)
     texts = [
@@ -168,7 +174,7 @@ def _shapes(study, look):
     ]
     meshes = study["original"].children if has(study, "original") else {}
     names = names_of(report)
-    rows, linked = [], _linked(names, _pictures(study))
+    rows, linked = [], _linked(names, _picture_ids(study))
     for i, name in enumerate(names):
         size = ["", ""]
         if name in meshes:
@@ -178,45 +184,45 @@ def _shapes(study, look):
     return PARTS.table(head, rows, status.tolist(), name="the shapes")
 
 
-def _gallery(study, look):
+def _gallery(study, camera):
     names = list(study["coarse"].children)
     texts = {name: text for text, name in labelled(study, names)}
     meshes = [surface(study, name) for name in names]
-    frames = shared_frames([X for X, _ in meshes], look)
-    median, places = attribute(study, "latent", "median"), _pictures(study)
+    frames = shared_frames([X for X, _ in meshes], camera)
+    median, ids = attribute(study, "latent", "median"), _picture_ids(study)
     figures = []
     for name, (X, T), frame in zip(names, meshes, frames, strict=True):
-        pixels = render(X, T, size=(150, 130), frame=frame, **look)
+        pixels = render(X, T, size=(150, 130), frame=frame, **camera)
         caption = f"{texts[name]}, the median" if name == median else texts[name]
-        figures.append(PARTS.picture(pixels, caption, name == median, places[name]))
+        figures.append(PARTS.picture(pixels, caption, name == median, ids[name]))
     kinds = {low_text(study["coarse"][name].dataset) or "low-resolution meshes" for name in names}
-    note = PARTS.note(f"The {' and '.join(sorted(kinds))}, all at one scale.")
+    note = PARTS.note(f"The {' and '.join(sorted(kinds))}, at one scale.")
     return note + PARTS.grid(figures, "gallery")
 
 
-def _network(study, look):
+def _network(study, camera):
     pairs = study["network"].dataset
     source, target = (pairs[key].values.astype(str) for key in ("source", "target"))
     names = np.unique(np.r_[source, target]).tolist()
-    places = network_positions(study, names)
-    where = "placed by the first two components of their area-based shape differences"
-    if places is None:
-        places, where = charts.on_circle(len(names)), "on a circle"
+    positions = network_positions(study, names)
+    layout = "placed by the first two principal components of the area-based shape differences"
+    if positions is None:
+        positions, layout = charts.on_circle(len(names)), "on a circle"
     errors = {}
     for key, when in (("cycle_error_initial", "before"), ("cycle_error", "after")):
         if key in pairs:
             errors[f"{when} Consistent ZoomOut"] = pairs[key].values
     ends = np.searchsorted(names, source), np.searchsorted(names, target)
     median = _index(names, attribute(study, "latent", "median"))
-    figure = charts.network(places, names, *ends, errors, median)
-    note = f"{len(source)} maps among {len(names)} shapes, {where}; the median is circled. "
-    note += "Both errors are of the first modes, as many as the maps had before."
+    figure = charts.network(positions, names, *ends, errors, median)
+    note = f"{len(source)} maps among {len(names)} shapes, {layout}; the median is circled. "
+    note += "Both errors are those of the eigenfunctions of the initial maps."
     if any(np.isnan(values).any() for values in errors.values()):
-        note += " Grey maps are in no cycle: their error is unknown."
+        note += " Grey maps are in no cycle, so their error is unknown."
     return PARTS.note(note) + PARTS.drawing(figure, "the network of maps, coloured by cycle error")
 
 
-def _maps(study, look):
+def _maps(study, camera):
     pairs = study["network"].dataset
     order = np.arange(pairs.sizes["pair"])
     if "cycle_error" in pairs:
@@ -226,12 +232,12 @@ def _maps(study, look):
     for key, when in (("fmap_initial", "before"), ("fmap", "after")):
         if key in pair:
             C = pair[key].values
-            matrices[f"{when} Consistent ZoomOut, {C.shape[1]} modes"] = C
-    text = f"{pair['source'].item()} → {pair['target'].item()}, a pair of median cycle error"
+            matrices[f"{when} Consistent ZoomOut, {C.shape[1]} eigenfunctions"] = C
+    text = f"{pair['source'].item()} → {pair['target'].item()}, the pair of median cycle error"
     return PARTS.note(text) + PARTS.drawing(charts.matrices(matrices), text)
 
 
-def _distances(study, look):
+def _distances(study, camera):
     distance = study["latent"].dataset["distance_to_limit"]
     names = names_of(distance)
     median = _index(names, attribute(study, "latent", "median"))
@@ -240,44 +246,44 @@ def _distances(study, look):
     return note + PARTS.drawing(figure, "the shapes ranked by their distance to the limit shape")
 
 
-def _moved(study, look):
-    """Sliders that move the mean shape; pictures drawn in advance where they cannot."""
+def _sliders(study, camera):
+    """Return sliders that deform the mean shape, with precomputed pictures as a fallback."""
     n_frames = 13 if study["registration"].sizes["vertex"] < 50_000 else 7
     sigmas, ratio = np.linspace(-SIGMA, SIGMA, n_frames).tolist(), _ratio(study)
     sliders = []
-    for mode, drawn in enumerate(mode_pictures(study, sigmas, len(ratio), **look)):
+    for mode, drawn in enumerate(mode_pictures(study, sigmas, len(ratio), **camera)):
         frames, labels = list(map(webp_uri, drawn)), [_label(mode, s) for s in sigmas]
         sliders.append(PARTS.slider(mode, frames, labels, f"{ratio[mode]:.1%} of the variance"))
-    return _live_modes(study, PARTS.grid(sliders), look)
+    return _live_modes(study, PARTS.grid(sliders), camera)
 
 
 def _ratio(study):
-    """Shares of variance of the first modes, which are drawn."""
+    """Return the explained variance ratios of the modes that are drawn."""
     return study["pca"]["explained_variance_ratio"].values[:N_MODES]
 
 
 def _label(mode, sigma):
     amount = f"{sigma:+.3g} σ".replace("-", "−") if sigma else "mean"
-    return f"component {mode + 1}, {amount}"
+    return f"mode {mode + 1}, {amount}"
 
 
-def _modes(study, look):
+def _modes(study, camera):
     limit, unit = mode_limits(study)[0], study["pca"]["deformation"].attrs.get("units", "")
     scores, n_modes, pictures = (-SIGMA, 0, SIGMA), len(_ratio(study)), []
-    behind = mode_pictures(study, [SIGMA], n_modes, **look | {"view": opposite(look["view"])})
-    for mode, drawn in enumerate(mode_pictures(study, scores, n_modes, **look)):
+    behind = mode_pictures(study, [SIGMA], n_modes, **camera | {"view": opposite(camera["view"])})
+    for mode, drawn in enumerate(mode_pictures(study, scores, n_modes, **camera)):
         texts = [_label(mode, score) for score in scores]
         pictures += map(PARTS.picture, drawn, texts)
         pictures.append(PARTS.picture(behind[mode][0], f"{texts[-1]}, from behind"))
-    note = "Blue is expansion, red is compression, against the mean; one colour scale for all, "
-    note += "that of the sliders. What moves farther has the full colour."
+    note = "Blue is expansion and red is compression relative to the mean, on the colour scale of "
+    note += "the sliders. Larger displacements have the colours at the ends."
     bar = charts.color_bar(SIGNED, -limit, limit, f"displacement along the normal ({unit})")
     grid = PARTS.grid(pictures, "row four")
     return PARTS.note(note) + grid + PARTS.drawing(bar, "colour bar")
 
 
-def _live_modes(study, instead, look):
-    """Sliders that move the mean shape in the browser, on low resolution where it is large."""
+def _live_modes(study, fallback, camera):
+    """Return sliders that deform the mean shape in the browser, at low resolution if large."""
     coarse = template_coarse(study)
     if study["registration"].sizes["vertex"] <= LARGE:
         coarse = None
@@ -285,11 +291,11 @@ def _live_modes(study, instead, look):
     unit = study["pca"]["deformation"].attrs.get("units", "")
     state = {
         **mesh_state(mean, T, deformation),
-        **look_state(mode_limits(study), unit, **look),
+        **appearance_state(mode_limits(study), unit, **camera),
         **score_state(study, N_LIVE),
         "scores": [0.0] * len(deformation),
         "colors": "normal",
-        "beside": False,
+        "side_by_side": False,
         "sample": -1,
         "group": "",
         "height": 500,
@@ -298,18 +304,18 @@ def _live_modes(study, instead, look):
     }
     size = f"{len(mean):,} vertices" + ("" if coarse is None else ", low resolution")
     if study["pca"].sizes["component"] > N_LIVE:
-        size += f", the first {N_LIVE} components"
-    return PARTS.modes(state, MODES, size, instead)
+        size += f", the first {N_LIVE} modes"
+    return PARTS.modes(state, MODES, size, fallback)
 
 
-def _variance(study, look):
+def _variance(study, camera):
     pca = study["pca"].dataset
     low = pca.get("explained_variance_ratio_low")
     figure = charts.variance(pca["explained_variance_ratio"].values, low)
     return PARTS.drawing(figure, "cumulative explained variance")
 
 
-def _scores(study, look):
+def _scores(study, camera):
     pca = study["pca"].dataset
     state = score_state(study)
     names, faint = state["names"], state["faint"]
@@ -318,14 +324,14 @@ def _scores(study, look):
     text = "scores of the shapes; the template is orange"
     if any(faint):
         text += ", flagged shapes are grey"
-    beyond = pca.sizes.get("shape_excluded", 0) - sum(name not in names_of(pca) for name in names)
+    n_hidden = pca.sizes.get("shape_excluded", 0) - sum(name not in names_of(pca) for name in names)
     note = ""
-    if beyond:
-        note = PARTS.note(f"{beyond} flagged shapes lie too far away to be drawn.")
+    if n_hidden:
+        note = PARTS.note(f"{n_hidden} flagged shapes are outside the chart.")
     return Markup(note) + PARTS.drawing(figure, text)
 
 
-def _correspondence(study, look):
+def _correspondence(study, camera):
     registration = study["registration"].dataset
     X, T = mesh_of(registration)
     colors = position_colors(X)
@@ -333,29 +339,29 @@ def _correspondence(study, look):
     surfaces: dict[str, Any] = {f"{template}, the template": (X, T, colors)}
     others = [name for name in names_of(registration) if name != template]
     surfaces |= {name: transferred_colors(study, name, colors) for name in others[:N_TRANSFERRED]}
-    surfaces = {name: one for name, one in surfaces.items() if one is not None}
-    frames = shared_frames([X for X, _, _ in surfaces.values()], look)
+    surfaces = {name: arrays for name, arrays in surfaces.items() if arrays is not None}
+    frames = shared_frames([X for X, _, _ in surfaces.values()], camera)
     figures = []
     for (name, (X, T, colors)), frame in zip(surfaces.items(), frames, strict=True):
-        pixels = render(X, T, colors=colors, size=PANEL, frame=frame, **look)
+        pixels = render(X, T, colors=colors, size=PANEL, frame=frame, **camera)
         figures.append(PARTS.picture(pixels, name))
-    note = "The template's coordinates as colours, carried to other shapes: "
-    note += "the same colour is the same place."
+    note = "The template's coordinates as colours, transferred to other shapes: "
+    note += "corresponding points have the same colour."
     return PARTS.note(note) + PARTS.grid(figures)
 
 
-def _confidence(study, look):
+def _confidence(study, camera):
     registration = study["registration"].dataset
     X, T = mesh_of(registration)
-    apart = left_out(study)
-    names = [name for name in names_of(registration) if name not in apart]
+    excluded = left_out(study)
+    names = [name for name in names_of(registration) if name not in excluded]
     registration = registration.sel(shape=names)
     confidence = registration["confidence"]
     mean, names = confidence.mean("vertex").values, names_of(registration)
 
     def painted(caption, X, values, high):
         colors = ramp_colors(values, 0, high)
-        return PARTS.picture(render(X, T, colors=colors, size=PANEL, **look), caption)
+        return PARTS.picture(render(X, T, colors=colors, size=PANEL, **camera), caption)
 
     caption = "mean over the shapes, on the template"
     figures = [painted(caption, X, confidence.mean("shape").values, 1)]
@@ -364,22 +370,22 @@ def _confidence(study, look):
         caption = f"{names[i]}: {mean[i]:.2f} on average"
         figures.append(painted(caption, moved, confidence.isel(shape=i).values, 1))
     others = {
-        "round_trip": "cycle error, shares of sqrt(area)",
+        "round_trip": "cycle error in units of sqrt(area)",
         "distortion": "distortion |log(area ratio)|",
     }
-    for key, words in others.items():
+    for key, text in others.items():
         if key in registration:
             value = np.abs(registration[key]).mean("shape").values
             limit = charts.reach(value, 0.95) or 1.0
-            caption = f"{words}, from 0 to {limit:.2g}; mean over the shapes"
+            caption = f"{text}, from 0 to {limit:.2g}; mean over the shapes"
             figures.append(painted(caption, X, value, limit))
-    note = "Everywhere, and the shapes where it is lowest; "
-    note += "what the registration does to the surface."
+    note = "Mean confidence on the template, the two shapes with the lowest confidence, and the "
+    note += "distortion by the registration."
     bar = charts.color_bar("viridis", 0, 1, "confidence")
     return PARTS.note(note) + PARTS.grid(figures) + PARTS.drawing(bar, "colour bar")
 
 
-def _resources(study, look):
+def _resources(study, camera):
     report = study["report"].dataset
     heads = {"seconds": "seconds", "peak_memory": "peak memory (MiB)"}
     heads = {key: head for key, head in heads.items() if key in report}
@@ -389,10 +395,10 @@ def _resources(study, look):
     return PARTS.table(["stage", *heads.values()], rows, name="time and memory")
 
 
-def _parameters(study, look):
+def _parameters(study, camera):
     attrs = study["report"].attrs
     rows = [[name, str(value)] for name, value in kept_options(study).items()]
-    # the keys of all that was registered are no parameter, and wider than any page
+    # the keys of the registered shapes are not parameters, and too long for a page
     others = [[key, value] for key, value in attrs.items() if str(value)]
     rows += [row for row in others if row[0] not in ("made_from", "options")]
     if not rows:
@@ -400,9 +406,9 @@ def _parameters(study, look):
     return PARTS.table(["parameter", "value"], rows, name="parameters")
 
 
-# heading, what of the study it needs, and what writes it
+# heading, required variables, and the function that writes the section
 SECTIONS = (
-    ("Move the modes", ["registration/position", "pca/deformation"], _moved),
+    ("Explore the modes of variation", ["registration/position", "pca/deformation"], _sliders),
     ("Modes of variation", ["registration/position", "pca/deformation"], _modes),
     ("Shapes", ["report/status"], _shapes),
     ("Gallery", ["coarse"], _gallery),

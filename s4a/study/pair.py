@@ -79,7 +79,7 @@ def match_pair(
     >>> s4a.show.charts.surfaces(
     ...     {"source": source, "target": target}, {"source": colors, "target": colors[match]}
     ... )
-    <Parts ...>
+    <TiledFigure ...>
     """
     settings = given_options({"preset": preset, **options}, pair=True)
     meshes = as_mesh(source, "source"), as_mesh(target, "target")

@@ -233,8 +233,9 @@ class Comparison(Panel):
         if there >= 0:
             self.scenes[0].mark(X[there])
         elif self.vertex >= 0:
-            images = [self.values("match", control.value)[self.vertex] for control in self.methods]
-            images = np.array(images)
+            images = np.array(
+                [self.values("match", control.value)[self.vertex] for control in self.methods]
+            )
             colors = np.array(MARKS[: len(images)])
             self.scenes[0].mark(X[images[images >= 0]], colors[images >= 0])
         else:

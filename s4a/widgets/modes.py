@@ -10,7 +10,7 @@ from s4a.geometry.mesh import vertex_normals
 from s4a.input.files import write_mesh
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import apply_scores, mahalanobis, plausible_scores
-from s4a.show.browser import MODES, look_state, mesh_state, to_bytes
+from s4a.show.browser import MODES, appearance_state, mesh_state, to_bytes
 from s4a.show.draw import signed_colors
 from s4a.show.surfaces import (
     N_LIVE,
@@ -72,7 +72,7 @@ class ModesView(View):
         self.arrays = mean, triangles, deformation
         super().__init__(
             **mesh_state(mean, triangles, deformation),
-            **look_state(limits, unit, view, up),
+            **appearance_state(limits, unit, view, up),
             scores=[0.0] * len(deformation),
             **options,
         )

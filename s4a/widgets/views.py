@@ -84,7 +84,7 @@ class View(anywidget.AnyWidget):
 
     Attributes
     ----------
-    turn : list of float
+    rotation : list of float
         Rows of the initial rotation.
     group : str
         Views of one group rotate together.
@@ -96,7 +96,7 @@ class View(anywidget.AnyWidget):
     still = traitlets.Bytes().tag(sync=True)
     webgl = traitlets.Unicode("").tag(sync=True)
     group = traitlets.Unicode("").tag(sync=True)
-    turn = traitlets.List().tag(sync=True)
+    rotation = traitlets.List().tag(sync=True)
     height = traitlets.Int(360).tag(sync=True)  # pixels
 
     def drawn(self) -> tuple | None:
@@ -110,7 +110,7 @@ class View(anywidget.AnyWidget):
             return b""
         points, triangles, colors = drawn
         # the rotation is applied here; the renderer looks along z from the top
-        rotated = points @ np.reshape(self.turn, (3, 3)).T
+        rotated = points @ np.reshape(self.rotation, (3, 3)).T
         pixels = render(rotated, triangles, colors=colors, view="top", size=SIZE)
         return image_bytes(on_white(pixels), "png")
 
@@ -143,7 +143,7 @@ class Scene(View):
         If True, a drag selects vertices instead of rotating the surface.
     drawn_around : dict
         The lasso selection: its ``polygon (q, 2)`` in the plane of the view, in the unit of the
-        surface, the rotation ``turn`` of that view, and its number `count`.
+        surface, the ``rotation`` of that view, and its number `count`.
     answer : int
         Number of the pick to which marks and caption belong; -1 for none.  If a later pick exists
         in any view of the group, they are not shown.
@@ -178,7 +178,7 @@ class Scene(View):
     surface = colors = coordinates = None  # the traits as arrays
 
     def __init__(self, *, view="corner", up="z", **options):
-        super().__init__(turn=rotation(view, up).ravel().tolist(), **options)
+        super().__init__(rotation=rotation(view, up).ravel().tolist(), **options)
         self.observe(self.draw_still, ["webgl", "points"])
 
     def show(

@@ -585,7 +585,7 @@ def test_a_regression_is_a_mode_that_page_panel_and_animation_show(simulated, tm
     panel.scores = [1.5]
     assert panel.vertices() == pytest.approx(later, abs=1e-5)
     panel.close()
-    assert "component 1" in write_page(moving, tmp_path / "page.html").read_text()
+    assert "mode 1" in write_page(moving, tmp_path / "page.html").read_text()
     path = write_film(moving, tmp_path / "age.gif", mode=None, n_frames=4, width=100)
     with Image.open(path) as picture:
         assert (picture.n_frames, picture.width) == (4, 100)

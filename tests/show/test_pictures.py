@@ -27,24 +27,24 @@ def reddest(part):
 
 def film_frames(path):
     with Image.open(path) as film:
-        found = []
+        frames = []
         for i in range(film.n_frames):
             film.seek(i)
-            found.append(np.asarray(film.convert("RGB")).astype(int))
-    return found
+            frames.append(np.asarray(film.convert("RGB")).astype(int))
+    return frames
 
 
 def test_a_picture_of_the_modes_is_blue_where_the_shape_grows(study, tmp_path):
     path = s4a.write_picture(study, tmp_path / "modes.png", view="front", width=360)
-    found = pixels(path)
-    assert found.shape[1] == 360
-    small, mean, large = np.split(found[: len(found) // 4], 3, axis=1)
+    frames = pixels(path)
+    assert frames.shape[1] == 360
+    small, mean, large = np.split(frames[: len(frames) // 4], 3, axis=1)
     assert (reddest(small) > 0).all()
     assert (reddest(large) < 0).all()
     assert len(reddest(mean)) == 0
 
 
-def test_a_picture_has_the_wanted_width_and_ground(study, tmp_path):
+def test_a_picture_has_the_given_width_and_background(study, tmp_path):
     options = {"mode": 1, "score": 2, "width": 401}
     for transparent in (False, True):
         path = s4a.write_picture(study, tmp_path / "a.png", transparent=transparent, **options)
@@ -60,7 +60,7 @@ def test_a_picture_that_is_rendered_in_bands_is_the_same(study, tmp_path, monkey
     whole = pixels(s4a.write_picture(study, tmp_path / "whole.png", **options))
     monkeypatch.setattr(s4a.show.pictures, "BAND", 200 * 40)
     bands = pixels(s4a.write_picture(study, tmp_path / "bands.png", **options))
-    assert np.abs(whole - bands).max() < 40  # the shade of creases reaches less far
+    assert np.abs(whole - bands).max() < 40  # the shade of creases is cut off
     assert np.abs(whole - bands).mean() < 1
 
 
@@ -78,18 +78,18 @@ def test_the_colour_bar_has_the_limits_of_the_panels(study, tmp_path, monkeypatc
     assert any("mode 1" in text and "−2.0 σ" in text for text in words)
 
 
-def test_numbers_that_are_nowhere_negative_begin_at_0_in_white(tmp_path):
+def test_the_scale_of_nonnegative_numbers_begins_at_0_in_white(tmp_path):
     X, T = sphere()
     values = np.clip(X[:, 2], 0, None)
-    found = pixels(
+    frames = pixels(
         s4a.write_picture(as_dataset(X, T), tmp_path / "a.png", values=values, width=200)
     )
-    assert (reddest(found[:100]) < 0).all()
-    assert len(reddest(found[:100])) > 100
-    assert len(reddest(found[150:190])) == 0
+    assert (reddest(frames[:100]) < 0).all()
+    assert len(reddest(frames[:100])) > 100
+    assert len(reddest(frames[150:190])) == 0
 
 
-def test_a_panel_is_drawn_as_it_stands_without_a_browser(tmp_path):
+def test_a_panel_is_drawn_in_its_current_state_without_a_browser(tmp_path):
     widgets = pytest.importorskip("s4a.widgets")
     panel = widgets.FunctionalMap(s4a.synthetic.example_study())
     first = pixels(s4a.write_picture(panel, tmp_path / "a.png", width=300))
@@ -100,7 +100,7 @@ def test_a_panel_is_drawn_as_it_stands_without_a_browser(tmp_path):
     panel.close()
 
 
-def test_every_panel_with_a_surface_is_drawn_and_of_tabs_the_one_that_is_seen(tmp_path):
+def test_every_panel_with_a_surface_is_drawn_and_of_tabs_the_selected_one(tmp_path):
     panels = pytest.importorskip("s4a.widgets.explore")
     tabs = panels.explore(s4a.synthetic.example_study())
     sizes = []
@@ -122,7 +122,7 @@ def test_values_of_another_mesh_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("n_frames", [7, 48])
-def test_a_film_takes_its_seconds(study, tmp_path, n_frames):
+def test_a_film_has_the_given_duration(study, tmp_path, n_frames):
     path = s4a.write_film(study, tmp_path / "a.gif", n_frames=n_frames, width=100, seconds=4)
     with Image.open(path) as film:
         total = 0
@@ -146,7 +146,7 @@ def test_a_film_of_a_mode_goes_to_both_ends_and_back(study, tmp_path):
 
 
 @pytest.mark.parametrize("ending", ["gif", "webp", "apng"])
-def test_a_film_of_one_turn_shows_every_side(tmp_path, ending):
+def test_a_film_of_one_rotation_shows_every_side(tmp_path, ending):
     X, T = sphere()
     colors = np.where(X[:, :1] > 0, [[1.0, 0, 0]], [[0, 0, 1.0]])
     path = tmp_path / f"a.{ending}"
@@ -160,7 +160,7 @@ def test_a_film_of_one_turn_shows_every_side(tmp_path, ending):
 
 
 @pytest.mark.parametrize(
-    "name, options, found",
+    "name, options, message",
     [
         ("a.jpg", {}, r"\.png, found a.jpg"),
         ("a.png", {"width": 3841}, "from 100 to 3840, found 3841"),
@@ -168,13 +168,13 @@ def test_a_film_of_one_turn_shows_every_side(tmp_path, ending):
         ("a.png", {"mode": 0}, "mode needs whole numbers from 1 to 3, found 0"),
     ],
 )
-def test_what_no_picture_can_be_is_refused(study, tmp_path, name, options, found):
-    with pytest.raises(ValueError, match=found):
+def test_an_impossible_picture_is_refused(study, tmp_path, name, options, message):
+    with pytest.raises(ValueError, match=message):
         s4a.write_picture(study, tmp_path / name, **options)
     assert not (tmp_path / name).exists()
 
 
-def test_what_no_film_can_be_is_refused(study, tmp_path):
+def test_an_impossible_film_is_refused(study, tmp_path):
     with pytest.raises(ValueError, match=r"found a\.webm; a panel's Save film writes WebM"):
         s4a.write_film(study, tmp_path / "a.webm")
     with pytest.raises(ValueError, match="turn=True"):

@@ -1,4 +1,4 @@
-"""Pictures and the page of a study, on a small made-up study of ellipsoids."""
+"""Pictures and the page of a study, on a small simulated study of ellipsoids."""
 
 import base64
 import json
@@ -117,7 +117,7 @@ def test_a_sphere_is_drawn_as_a_disk_of_its_area():
     assert picture[0, 0, 3] == 0
 
 
-def test_the_nearer_surface_hides_the_farther_whatever_their_order():
+def test_the_front_surface_hides_the_back_one_in_any_order():
     X, T = sphere()
     both = np.concatenate([X, 0.5 * X + draw.rotation()[2] * 2])
     colors = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], len(X), axis=0)
@@ -157,7 +157,7 @@ def test_the_up_axis_points_up_and_views_are_rotations(up):
     assert np.allclose(draw.rotation("front", up) @ axis, [0, 1, 0])
 
 
-def test_labels_are_not_mixed():
+def test_labels_are_not_interpolated():
     X, T = sphere()
     colors = draw.label_colors((X[:, 0] > 0).astype(int))
     picture = draw.render(X, T, colors=colors, flat=True, view="top", size=(100, 100))
@@ -195,18 +195,18 @@ def test_the_page_is_one_file_without_any_address_outside(html):
     assert "http" not in re.sub(r"data:[^\"]*|http://www.w3.org/2000/svg", "", html)
     assert len(html) < 8e6
     assert html.count("<section>") == len(page.SECTIONS)
-    assert "Not there" not in html
+    assert "Missing:" not in html
 
 
-def test_sliders_come_first_and_the_contents_lead_to_every_section(html):
+def test_sliders_are_first_and_the_contents_link_to_every_section(html):
     headings = re.findall(r'<h2 id="(section-\d+)">(.*?)</h2>', html)
-    assert headings[0][1] == "Move the modes"
+    assert headings[0][1] == "Explore the modes of variation"
     contents = re.search(r'<nav aria-label="contents">(.*?)</nav>', html, re.DOTALL)[1]
     assert re.findall(r'<a href="#(.*?)">(.*?)</a>', contents) == headings
     assert len(headings) == len(page.SECTIONS)
 
 
-def test_warnings_stand_at_the_top_and_every_shape_leads_to_its_picture(study):
+def test_warnings_are_at_the_top_and_every_shape_links_to_its_picture(study):
     part = study.copy()
     report = part["report"].to_dataset()
     kinds = ["", "mirrored", "", "", "", "", ""]
@@ -224,8 +224,8 @@ def test_warnings_stand_at_the_top_and_every_shape_leads_to_its_picture(study):
     pictures = dict(re.findall(r'<figure id="(shape-\d)".*?<figcaption>(.*?)</figcaption>', text))
     for kind, name in (("mirrored", "shape-1"), ("size", "shape-3")):
         line = re.search(rf"<li class=.*?{kind}.*?</li>", top)[0]
-        place = re.search(rf'<a href="#(.*?)">{name}</a>', line)[1]
-        assert pictures[place].startswith(name)
+        target = re.search(rf'<a href="#(.*?)">{name}</a>', line)[1]
+        assert pictures[target].startswith(name)
     shapes = text[text.index("Shapes</h2>") :]
     assert len(set(re.findall(r'<td><a href="#(shape-\d)">', shapes))) == N_SHAPES
 
@@ -237,15 +237,15 @@ def test_text_of_the_study_is_escaped(html):
     assert "&lt;script&gt;alert" in html
 
 
-def test_the_page_says_what_the_study_says(html):
+def test_the_page_shows_the_results_of_the_study(html):
     summary = "7 shapes, 1 repaired, 0 flagged, 1 excluded; median shape-2; template shape-2; "
-    summary += "the first 3 components hold 100%"
+    summary += "the first 3 modes explain 100%"
     for text in (
         summary,
         "shape-2, the median",
         "n_coarse",
         "1,200",
-        "component 3, +3 σ, from behind",
+        "mode 3, +3 σ, from behind",
         "70.0% of the variance",
     ):
         assert text in html
@@ -261,7 +261,7 @@ def test_the_page_holds_the_modes_as_they_are(study, html):
     deformation = np.frombuffer(base64.b64decode(state["deformation"]["base64"]), "<f4")
     assert (deformation == study["pca"]["deformation"].values.ravel().astype(np.float32)).all()
     assert state["ratio"] == [0.7, 0.2, 0.1]
-    assert 'id="modes-instead"' in html.replace("'", '"')
+    assert 'id="modes-fallback"' in html.replace("'", '"')
 
 
 def test_sliders_and_pictures_of_a_page_have_the_same_scale(study, html):
@@ -289,7 +289,7 @@ def test_of_many_modes_the_page_holds_the_first(study, monkeypatch):
     deformation = np.frombuffer(base64.b64decode(state["deformation"]["base64"]), "<f4")
     assert (deformation == study["pca"]["deformation"].values[:2].ravel().astype("<f4")).all()
     assert {len(scores) for scores in state["samples"]} == {len(state["ratio"])} == {2}
-    assert "the first 2 components" in html
+    assert "the first 2 modes" in html
 
 
 def test_the_page_is_the_same_every_time(study, html):
@@ -302,12 +302,12 @@ def test_the_page_is_the_same_every_time(study, html):
 def test_an_unfinished_study_shows_what_there_is(study, node, tmp_path, monkeypatch):
     for module in (page, pictures):
         monkeypatch.setattr(
-            module, "render", lambda *surface, **look: np.zeros((2, 2, 4), np.uint8)
+            module, "render", lambda *surface, **options: np.zeros((2, 2, 4), np.uint8)
         )
     part = study.copy()
     del part[node]
     text = page.write_page(part, tmp_path / "page.html").read_text(encoding="utf-8")
-    assert ("Not there" in text) == (node != "original")
+    assert ("Missing:" in text) == (node != "original")
     assert text.count("<section>") == len(page.SECTIONS)
 
 
@@ -316,7 +316,7 @@ def test_a_vertex_of_unknown_distortion_leaves_the_others_their_colours(study, m
     monkeypatch.setattr(
         page, "ramp_colors", lambda values, low, high: limits.append(high) or 0 * values[:, None]
     )
-    monkeypatch.setattr(page, "render", lambda *surface, **look: np.zeros((2, 2, 4), np.uint8))
+    monkeypatch.setattr(page, "render", lambda *surface, **options: np.zeros((2, 2, 4), np.uint8))
     registration = study["registration"].to_dataset()
     values = np.random.default_rng(0).random(registration["confidence"].shape)
     values[:, 3] = np.nan
@@ -332,7 +332,7 @@ def test_a_vertex_of_unknown_distortion_leaves_the_others_their_colours(study, m
 def test_an_empty_study_gives_a_page_too():
     text = page.study_html(xr.DataTree())
     assert "The study is empty." in text
-    assert text.count("Not there") == len(page.SECTIONS)
+    assert text.count("Missing:") == len(page.SECTIONS)
 
 
 def test_modes_that_could_not_be_are_explained(study):

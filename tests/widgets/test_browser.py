@@ -179,10 +179,11 @@ def test_both_ends_of_a_mode_side_by_side(page):
     )
     shown = visible(page, VIEW)
     assert len({pixels(shown.nth(i)) for i in range(3)}) == 3
-    turned = shown.nth(2).evaluate("(c) => [...c.view.camera.turn]")
+    rotation = "(c) => [...c.view.camera.rotation]"
+    turned = shown.nth(2).evaluate(rotation)
     shown.nth(0).focus()
     page.keyboard.press("ArrowLeft")
-    assert shown.nth(2).evaluate("(c) => [...c.view.camera.turn]") != turned, "cameras are linked"
+    assert shown.nth(2).evaluate(rotation) != turned, "cameras are linked"
     button.click()
 
 
@@ -219,7 +220,7 @@ def test_a_clicked_bar_shows_its_shape(page):
     visible(page, ".s4a-readout").filter(has_text="rank 4 of 5").wait_for()
 
 
-def test_a_clicked_point_is_carried_to_the_shape(page, study):
+def test_a_clicked_point_is_mapped_to_the_shape(page, study):
     open_tab(page, "Correspondence")
     canvas = visible(page, VIEW).first
     box = canvas.bounding_box()
@@ -234,7 +235,7 @@ def test_a_clicked_point_is_carried_to_the_shape(page, study):
     )
 
 
-def test_a_landmark_is_placed_and_carried_over(page, study):
+def test_a_landmark_is_placed_and_transferred(page, study):
     open_tab(page, "Transfer")
     canvas = visible(page, VIEW).first
     box, count = canvas.bounding_box(), study["original/brain_01"].sizes["landmark"]
@@ -248,7 +249,7 @@ def test_the_keyboard_places_a_landmark(page, study):
     count = canvas.evaluate("(c) => c.view.points.length")
     start, moved = cursor(canvas), cursor(canvas, *["ArrowRight"] * 4)
     X = vertices(canvas)
-    right = canvas.evaluate("(c) => c.view.camera.turn.slice(0, 3)")
+    right = canvas.evaluate("(c) => c.view.camera.rotation.slice(0, 3)")
     assert (X[moved] - X[start]) @ right > 0.05 * np.ptp(X, axis=0).max(), (
         "the arrow keys move the cursor"
     )
@@ -272,7 +273,7 @@ def test_a_landmark_is_a_lit_sphere_of_its_radius_in_the_datas_unit(page):
     assert pixels(canvas) != before
 
 
-def test_the_keyboard_carries_points_to_the_shape(page, study):
+def test_the_keyboard_maps_points_to_the_shape(page, study):
     open_tab(page, "Correspondence")
     canvas = visible(page, VIEW).first
     at = cursor(canvas, "ArrowUp", "ArrowUp")
@@ -283,7 +284,7 @@ def test_the_keyboard_carries_points_to_the_shape(page, study):
     canvas.press("Escape")
 
 
-def test_nothing_is_said_or_marked_of_the_shape_before(page):
+def test_marks_and_captions_of_the_previous_shape_are_removed(page):
     shapes = page.get_by_label("shape", exact=True).filter(visible=True)
     *_, one, other = shapes.locator("option").all_inner_texts()
     canvas, said = visible(page, VIEW).first, visible(page, ".s4a-readout")
@@ -310,7 +311,7 @@ def test_whatever_can_be_clicked_has_a_name_and_is_reached_by_the_keyboard(page)
         open_tab(page, title)
         for canvas in visible(page, VIEW).all():
             assert canvas.get_attribute("tabindex") == "0"
-            assert "arrow keys turn" in canvas.get_attribute("aria-label")
+            assert "arrow keys rotate" in canvas.get_attribute("aria-label")
         unnamed = page.evaluate(
             "[...document.querySelectorAll("
             "'.s4a input, .s4a select, .s4a button, .s4a [role=button]')]"
@@ -347,7 +348,7 @@ def test_nothing_is_cut_off_at_800_pixels(page):
         settled(page, uncut)
 
 
-def test_nothing_scrolls_sideways_and_charts_are_seen_at_once_beside_the_files(page):
+def test_nothing_scrolls_sideways_and_charts_are_visible_next_to_the_files(page):
     """On a screen of 1366 by 768 pixels, with the file browser open."""
     page.set_viewport_size({"width": 1366, "height": 768})
     wide = """() => [...document.querySelectorAll(".jp-Notebook, .jp-Notebook *")]
@@ -380,7 +381,7 @@ def sizes(browser, lab, messages):
     page = watched(browser.new_page(viewport={"width": 1920, "height": 1080}), messages)
     page.set_default_timeout(60_000)
     run_notebook(page, lab, "sizes.ipynb")
-    page.keyboard.press("Control+b")  # the files beside the notebook go
+    page.keyboard.press("Control+b")  # hide the files next to the notebook
     page.wait_for_function(f"{SEEN}.length === 4 && {SEEN}.every((view) => view.frames > 0)")
     yield page
     page.close()
@@ -426,7 +427,7 @@ def test_a_panel_fills_the_screen(sizes):
     assert panel.bounding_box()["width"] < 1000
 
 
-def test_a_field_has_room_for_its_number_beside_a_long_name(sizes):
+def test_a_field_has_room_for_its_number_and_a_long_name(sizes):
     for i in (0, 1):
         field = panel_of(tabs_of(sizes, i, "Transfer")).locator("input[type=number]")
         assert field.bounding_box()["width"] > 60
@@ -435,7 +436,7 @@ def test_a_field_has_room_for_its_number_beside_a_long_name(sizes):
 # ---- one glance
 
 
-def test_seven_tabs_stand_in_one_row_of_1000_pixels(sizes):
+def test_seven_tabs_are_in_one_row_of_1000_pixels(sizes):
     tabs = tabs_of(sizes, 1).locator(".lm-TabBar-tab")
     assert tabs.count() == 7
     assert len({tab.bounding_box()["y"] for tab in tabs.all()}) == 1
@@ -474,7 +475,7 @@ def test_both_ends_of_a_mode_take_the_full_width_and_stay_in_the_picture(sizes):
     )
     outside = """(c) => {
       const view = c.view, { w, h, scale } = view.placement(), P = view.surfaces[0].position;
-      const R = view.camera.turn, m = view.frame.centre;
+      const R = view.camera.rotation, m = view.frame.centre;
       let most = 0;
       for (let i = 0; i < P.length; i += 3) {
         const p = [0, 1, 2].map((k) => P[i + k] - m[k]);
@@ -490,7 +491,7 @@ def test_both_ends_of_a_mode_take_the_full_width_and_stay_in_the_picture(sizes):
 
 
 @pytest.mark.parametrize("title", TITLES)
-def test_every_control_says_what_it_is(sizes, title):
+def test_every_control_has_a_tooltip(sizes, title):
     panel = panel_of(tabs_of(sizes, 1, title))
     unsaid = panel.evaluate(
         "(e) => [...e.querySelectorAll('input, select, button, [role=slider]')]"
@@ -578,7 +579,7 @@ def returns(places):
     return [(places.index(p), i) for i, p in enumerate(places) if places.index(p) < i]
 
 
-def test_a_marker_never_returns_to_an_older_place_however_far_the_kernel(far):
+def test_a_marker_never_returns_to_an_older_point_with_a_slow_kernel(far):
     open_tab(far, "Correspondence")
     canvases = visible(far, VIEW)
     canvases.nth(1).wait_for()
@@ -684,7 +685,7 @@ def test_an_analysis_is_opened_while_it_runs_and_cancelled_and_resumed(
     page.locator(".jupyter-widgets .lm-TabBar-tabLabel", has_text="Spectrum").first.click()
     page.wait_for_function(DRAWN)
     page.get_by_role("button", name="Cancel", exact=True).click()
-    page.wait_for_selector("text=cancelled; Resume")
+    page.wait_for_selector("text=cancelled; press Resume")
     kept = {path: path.stat().st_mtime_ns for path in (folder / "run" / "coarse").glob("*.nc")}
     assert kept, "remeshed before the button came; how many, the machine's speed decides"
     assert not (folder / "run" / "pca.nc").exists()
@@ -756,10 +757,10 @@ def test_one_mode_has_no_chart_of_the_variance_of_many(show, study, components):
     some["pca"] = type(study)(study["pca"].to_dataset().isel(component=slice(components)))
     page = show(widgets.Modes(some))
     assert page.get_by_text("Scores: click").count() == 1
-    assert page.get_by_text("Cumulative variance").count() == components - 1
+    assert page.get_by_text("Explained variance").count() == components - 1
 
 
-def test_a_lasso_takes_what_is_seen_within_it(show, study):
+def test_a_lasso_selects_the_visible_vertices_inside(show, study):
     panel = Region(study, view="top")
     panel.lasso.value = True
     X, T = panel.X, panel.T
@@ -775,25 +776,25 @@ def test_a_lasso_takes_what_is_seen_within_it(show, study):
     drawn = page.evaluate(
         "Object.values(s4aModels).map((m) => m.get('drawn_around')).find((d) => d && d.polygon)"
     )
-    found = vertices_within(X, T, drawn["polygon"], drawn["turn"])
+    found = vertices_within(X, T, drawn["polygon"], drawn["rotation"])
     middle = (X[:, 0].max() + X[:, 0].min()) / 2
     assert found.mean() > 0.15
     assert X[found, 0].min() > middle - 3
     # without the lasso the same drag turns the surface
-    before = page.evaluate(f"{SEEN}[0].camera.turn")
-    assert np.allclose(before, drawn["turn"])
+    before = page.evaluate(f"{SEEN}[0].camera.rotation")
+    assert np.allclose(before, drawn["rotation"])
     page.evaluate(f"{SEEN}[0].lasso = false")
     page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(x + 60, y, steps=4)
     page.mouse.up()
-    assert not np.allclose(page.evaluate(f"{SEEN}[0].camera.turn"), before)
+    assert not np.allclose(page.evaluate(f"{SEEN}[0].camera.rotation"), before)
 
 
 SMOOTH = "(c) => c.view.smooth"
 
 
-def test_full_resolution_is_drawn_once_after_a_drag_and_not_within(show, study):
+def test_full_resolution_is_drawn_once_after_a_drag(show, study):
     page = show(widgets.Modes(study))
     page.wait_for_function(f"{SEEN}[0].smooth > 0")
     canvas = visible(page, VIEW).first
@@ -823,7 +824,7 @@ def test_full_resolution_is_drawn_once_after_a_drag_and_not_within(show, study):
 @pytest.fixture
 def few_values(monkeypatch):
     """A page keeps three values of a slider instead of two dozen."""
-    monkeypatch.setattr(panel_page, "LADDER", 3)
+    monkeypatch.setattr(panel_page, "N_VALUES", 3)
 
 
 @pytest.fixture(scope="module")
@@ -854,7 +855,7 @@ def test_the_page_of_a_study_fills_a_wide_screen_one_idea_at_a_time(
 def test_the_page_of_a_study_has_live_sliders(show, study, study_page):
     page = show(study_page)
     check_sliders(page, study)
-    assert not page.locator("#modes-instead").is_visible()
+    assert not page.locator("#modes-fallback").is_visible()
 
 
 def test_the_page_of_a_study_has_no_serious_barrier_and_one_screen_an_idea(show, study_page):
@@ -879,7 +880,7 @@ def test_a_saved_panel_has_no_serious_barrier(show, study, compared, few_values,
     assert barriers(show(panel, limit=200_000)) == []
 
 
-def test_the_page_of_the_network_shows_the_map_that_is_clicked(show, study):
+def test_the_page_of_the_network_shows_the_clicked_map(show, study):
     page = show(widgets.Network(study))
     edge = visible(page, ".s4a-edge").nth(6)
     source, target = re.match(r"(\w+) → (\w+)", edge.get_attribute("aria-label")).groups()
@@ -922,13 +923,13 @@ def map_page(study, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "map.html"
     panel = widgets.FunctionalMap(study)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(panel_page, "LADDER", 4)
+        patch.setattr(panel_page, "N_VALUES", 4)
         panel.save_html(path)
     panel.close()
     return path
 
 
-def test_the_page_of_a_map_replays_zoomout_and_shows_its_modes(show, map_page):
+def test_the_page_of_a_map_replays_zoomout_and_shows_its_eigenfunctions(show, map_page):
     page = show(map_page)
     before = pixels(visible(page, VIEW).first)
     move(page.locator("#c-k"), 1)
@@ -977,7 +978,7 @@ def test_the_axes_of_a_matrix_number_its_cells_and_nothing_overlaps(show, map_pa
     assert max(box["x"] + box["width"] for box in boxes) <= width
 
 
-def test_the_page_of_the_median_ranks_by_the_operator_that_is_chosen(show, study, few_values):
+def test_the_page_of_the_median_ranks_by_the_selected_operator(show, study, few_values):
     page = show(widgets.Median(study))
     chosen(page, "operator", "conformal")
     D = study["latent"]["conformal_difference"].values
@@ -992,9 +993,9 @@ def test_the_page_of_the_median_ranks_by_the_operator_that_is_chosen(show, study
     visible(page, ".s4a-readout").filter(has_text="rank 4 of 5").wait_for()
 
 
-def test_the_page_of_the_spectrum_moves_through_modes_and_reconstructions(show, study):
+def test_the_page_of_the_spectrum_shows_eigenfunctions_and_reconstructions(show, study):
     page = show(widgets.Spectrum(study))
-    move(page.locator("#c-mode"), 7)
+    move(page.locator("#c-index"), 7)
     visible(page, ".s4a-title").filter(has_text="φ7 of brain_01").wait_for()
     canvas = visible(page, VIEW).nth(1)
     before = vertices(canvas)
@@ -1037,7 +1038,7 @@ def compared():
     return s4a.compare(one, two, truth=truth, methods=["kNN", "RE-MATCH"], **options)
 
 
-def test_the_page_of_methods_marks_a_place_in_all_views(show, compared):
+def test_the_page_of_methods_marks_a_vertex_in_all_views(show, compared):
     panel = widgets.Comparison(compared, methods=["kNN", "RE-MATCH", "truth"])
     page = show(panel)
     for width, columns in ((1920, 4), (800, 2)):
@@ -1057,10 +1058,10 @@ def test_the_page_of_methods_marks_a_place_in_all_views(show, compared):
     views = visible(page, VIEW)
     there = views.first.evaluate("(c) => c.view.points.map((p) => p.slice(0, 3))")
     np.testing.assert_allclose(there, compared["source/position"].values[match], rtol=1e-5)
-    said = [text.inner_text() for text in visible(page, ".s4a-readout").all()[1:]]
+    texts = [text.inner_text() for text in visible(page, ".s4a-readout").all()[1:]]
     error = 100 * kept["algorithm_error"].values[1, at]
-    assert said[1] == f"target vertex {at} → source vertex {match[1]}, error {error:.2f} %"
-    assert said[2] == f"target vertex {at} → source vertex {match[2]}, error 0.00 %"
+    assert texts[1] == f"target vertex {at} → source vertex {match[1]}, error {error:.2f} %"
+    assert texts[2] == f"target vertex {at} → source vertex {match[2]}, error 0.00 %"
 
     at = cursor(views.first, "ArrowLeft")
     back = kept["algorithm_reverse"].values[:, at]
@@ -1071,7 +1072,7 @@ def test_the_page_of_methods_marks_a_place_in_all_views(show, compared):
 
 def test_the_page_of_a_transfer_says_what_needs_python(show, study):
     page = show(widgets.Transfer(study))
-    assert "placing landmarks" in page.locator(".note:not(#not-kept)").inner_text()
+    assert "placing landmarks" in page.locator(".note:not(#not-recorded)").inner_text()
     chosen(page, "target", "brain_05")
     visible(page, ".s4a-title").filter(has_text="brain_05, the target").wait_for()
     page.wait_for_selector("text=Landmarks on brain_05")
@@ -1084,7 +1085,7 @@ def test_without_webgl_pages_have_still_pictures(show, flat, study, study_page):
             "[...document.querySelectorAll('img')].some((i) => i.naturalWidth > 100)"
         )
         assert visible(page, VIEW).count() == 0
-    image = page.locator("#modes-instead img").first
+    image = page.locator("#modes-fallback img").first
     before = image.get_attribute("src")
-    move(page.locator("#modes-instead input").first, 0)
+    move(page.locator("#modes-fallback input").first, 0)
     assert image.get_attribute("src") != before

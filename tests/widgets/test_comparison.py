@@ -17,8 +17,8 @@ SMALL = {"n_coarse": 200, "k": 20, "k_init": 10, "n_geodesic": 50}
 
 
 @pytest.fixture(scope="module")
-def found():
-    """Two brains and what three methods find on the second; the last 100 truths are unknown."""
+def comparison():
+    """Matches of three methods between brains; the ground truth of 100 vertices is unknown."""
     brains = synthetic.brains(3, 700)
     source, *targets = (node.to_dataset() for node in brains["original"].children.values())
     names = list(brains["original"].children)
@@ -32,16 +32,16 @@ def found():
 
 
 @pytest.fixture
-def panel(found):
+def panel(comparison):
     before, made = len(registry._instances), []
 
     def make(**options):
-        made.append(Comparison(found, **options))
+        made.append(Comparison(comparison, **options))
         return made[-1]
 
     yield make
-    for one in made:
-        one.close()
+    for widget in made:
+        widget.close()
     assert len(registry._instances) == before
 
 
@@ -49,26 +49,26 @@ def floats(data):
     return np.frombuffer(data, "<f4").reshape(-1, 3)
 
 
-def test_what_is_kept_agrees_with_the_table(found):
-    table = found["metrics"].to_dataset()
-    for name, node in found["pairs"].children.items():
-        kept, X = node.to_dataset(), found["source/position"].values
-        one = table.sel(pair=name)
-        for way in METHODS:
+def test_kept_matches_agree_with_the_table(comparison):
+    table = comparison["metrics"].to_dataset()
+    for name, node in comparison["pairs"].children.items():
+        kept, X = node.to_dataset(), comparison["source/position"].values
+        metrics = table.sel(pair=name)
+        for method in METHODS:
             match, image = (
-                kept["algorithm_match"].sel(algorithm=way),
-                kept["algorithm_image"].sel(algorithm=way),
+                kept["algorithm_match"].sel(algorithm=method),
+                kept["algorithm_image"].sel(algorithm=method),
             )
-            if way != "registered surface":
+            if method != "registered surface":
                 np.testing.assert_allclose(image, X[match], atol=1e-4)
-            error = kept["algorithm_error"].sel(algorithm=way)
+            error = kept["algorithm_error"].sel(algorithm=method)
             assert float(error.mean()) == pytest.approx(
-                one["euclidean_error"].sel(algorithm=way).item()
+                metrics["euclidean_error"].sel(algorithm=method).item()
             )
             Y, T = kept["position"].values, kept["corner_vertex"].values
             expected = log_area_ratio(image.values.astype(float), Y, T)
             np.testing.assert_allclose(
-                kept["algorithm_area_change"].sel(algorithm=way), expected, atol=1e-3
+                kept["algorithm_area_change"].sel(algorithm=method), expected, atol=1e-3
             )
         assert np.isnan(kept["true_position"][-100:]).all()
         assert (kept["true_match"][-100:] == -1).all()
@@ -77,19 +77,19 @@ def test_what_is_kept_agrees_with_the_table(found):
         assert kept["algorithm_fmap_initial"].shape == (3, 10, 10)
 
 
-def test_without_keep_there_is_the_table_alone(found):
-    source, target = found["source"].to_dataset(), found["pairs/brain_02"].to_dataset()
+def test_without_keep_there_is_the_table_alone(comparison):
+    source, target = comparison["source"].to_dataset(), comparison["pairs/brain_02"].to_dataset()
     alone = compare(source, target[["position", "corner_vertex"]], methods=["kNN"], **SMALL)
     assert isinstance(alone, xr.Dataset)
     with pytest.raises(ValueError, match="keep=True"):
         Comparison(alone)
 
 
-def test_the_target_has_the_colours_of_the_places_where_a_method_puts_it(found, panel):
+def test_the_target_has_the_colours_of_the_matched_points(comparison, panel):
     shown = panel(methods=["RE-MATCH", "truth"])
-    X = found["source/position"].values
+    X = comparison["source/position"].values
     expected = (255 * position_colors(X)).round()
-    kept = found["pairs/brain_02"].to_dataset()
+    kept = comparison["pairs/brain_02"].to_dataset()
     colors = [np.frombuffer(scene.color, np.uint8).reshape(-1, 3) for scene in shown.scenes]
     np.testing.assert_allclose(colors[0], expected, atol=1)
     match = kept["algorithm_match"].sel(algorithm="RE-MATCH").values
@@ -104,7 +104,7 @@ def test_the_target_has_the_colours_of_the_places_where_a_method_puts_it(found, 
     np.testing.assert_allclose(floats(shown.scenes[1].coordinate), image, atol=1e-4)
 
 
-def test_errors_have_one_scale_and_the_mean_is_told(found, panel):
+def test_errors_have_one_scale_and_the_mean_is_shown(comparison, panel):
     shown = panel()
     assert [choice.value for choice in shown.methods] == ["RE-MATCH", "registered surface", "kNN"]
     shown.colors.value = "error"
@@ -112,7 +112,7 @@ def test_errors_have_one_scale_and_the_mean_is_told(found, panel):
     assert bars[0] == bars[1] == bars[2]
     mean = (
         100
-        * found["metrics/euclidean_error"]
+        * comparison["metrics/euclidean_error"]
         .sel(algorithm="registered surface", pair="brain_02")
         .item()
     )
@@ -120,7 +120,7 @@ def test_errors_have_one_scale_and_the_mean_is_told(found, panel):
     shown.pair.value = "brain_03"
     mean = (
         100
-        * found["metrics/euclidean_error"]
+        * comparison["metrics/euclidean_error"]
         .sel(algorithm="registered surface", pair="brain_03")
         .item()
     )
@@ -130,14 +130,14 @@ def test_errors_have_one_scale_and_the_mean_is_told(found, panel):
     assert shown.message.value == ""
 
 
-def test_a_point_is_marked_where_each_method_has_it(found, panel):
+def test_a_vertex_is_marked_with_its_match_by_each_method(comparison, panel):
     shown = panel(methods=["kNN", "registered surface"])
-    kept = found["pairs/brain_02"].to_dataset()
-    X, Y = found["source/position"].values, kept["position"].values
+    kept = comparison["pairs/brain_02"].to_dataset()
+    X, Y = comparison["source/position"].values, kept["position"].values
     shown.scenes[2].picked = {"vertex": 17, "count": 1}
     match = kept["algorithm_match"].sel(algorithm=["kNN", "registered surface"]).values[:, 17]
-    places = np.array([place[:3] for place in shown.scenes[0].points])
-    np.testing.assert_allclose(places, X[match])
+    marks = np.array([mark[:3] for mark in shown.scenes[0].points])
+    np.testing.assert_allclose(marks, X[match])
     assert shown.scenes[1].points[0][:3] == Y[17].tolist()
     error = 100 * kept["algorithm_error"].sel(algorithm="registered surface").values[17]
     assert shown.scenes[2].caption == (
@@ -150,20 +150,20 @@ def test_a_point_is_marked_where_each_method_has_it(found, panel):
     assert shown.scenes[1].caption.endswith("error unknown %")
 
 
-def test_a_place_of_the_source_stays_marked_where_another_method_has_it(found, panel):
+def test_a_vertex_of_the_source_is_marked_again_for_another_method(comparison, panel):
     shown = panel(methods=["kNN", "RE-MATCH"])
-    kept = found["pairs/brain_02"].to_dataset()
-    way_back = kept["algorithm_reverse"].sel(algorithm="registered surface").values
-    vertex = int(np.argmax(way_back >= 0))
+    kept = comparison["pairs/brain_02"].to_dataset()
+    reverse = kept["algorithm_reverse"].sel(algorithm="registered surface").values
+    vertex = int(np.argmax(reverse >= 0))
     shown.scenes[0].picked = {"vertex": vertex, "count": 1}
     shown.method0.value = "registered surface"
-    assert shown.scenes[1].points[0][:3] == kept["position"].values[way_back[vertex]].tolist()
-    assert shown.scenes[1].caption.startswith(f"target vertex {way_back[vertex]} → ")
-    assert shown.scenes[0].points[0][:3] == found["source/position"].values[vertex].tolist()
+    assert shown.scenes[1].points[0][:3] == kept["position"].values[reverse[vertex]].tolist()
+    assert shown.scenes[1].caption.startswith(f"target vertex {reverse[vertex]} → ")
+    assert shown.scenes[0].points[0][:3] == comparison["source/position"].values[vertex].tolist()
 
 
 @pytest.mark.parametrize("side", [0, 1])
-def test_nothing_is_marked_or_said_of_another_pair(panel, side):
+def test_marks_and_captions_are_removed_for_another_pair(panel, side):
     shown = panel(methods=["kNN", "truth"])
     shown.scenes[side].picked = {"vertex": 17, "count": 1}
     assert "vertex" in shown.scenes[1].caption
@@ -172,7 +172,7 @@ def test_nothing_is_marked_or_said_of_another_pair(panel, side):
     assert [scene.caption for scene in shown.scenes] == ["coordinates as colours", "", ""]
 
 
-def test_a_saved_page_leaves_the_place_that_was_picked(panel, tmp_path):
+def test_saving_a_page_keeps_the_picked_vertex(panel, tmp_path):
     shown = panel(methods=["kNN", "truth"])
     shown.scenes[0].picked = {"vertex": 17, "count": 1}
     before = [(scene.points, scene.caption) for scene in shown.scenes]
@@ -181,36 +181,36 @@ def test_a_saved_page_leaves_the_place_that_was_picked(panel, tmp_path):
     assert shown.source_vertex == 17
 
 
-def test_the_browser_knows_both_ways_and_the_errors(found, panel):
+def test_the_browser_gets_both_matches_and_the_errors(comparison, panel):
     scene = panel(methods=["RE-MATCH"]).scenes[1]
-    kept = found["pairs/brain_02"].to_dataset().sel(algorithm="RE-MATCH")
+    kept = comparison["pairs/brain_02"].to_dataset().sel(algorithm="RE-MATCH")
     assert (np.frombuffer(scene.link, "<i4") == kept["algorithm_match"]).all()
     assert (np.frombuffer(scene.link_back, "<i4") == kept["algorithm_reverse"]).all()
     np.testing.assert_array_equal(np.frombuffer(scene.link_values, "<f4"), kept["algorithm_error"])
 
 
-def test_without_truth_there_is_no_error(found, panel):
-    source, target = found["source"].to_dataset(), found["pairs/brain_02"].to_dataset()
+def test_without_ground_truth_there_is_no_error(comparison, panel):
+    source, target = comparison["source"].to_dataset(), comparison["pairs/brain_02"].to_dataset()
     mesh = target[["position", "corner_vertex"]]
-    one = Comparison(compare(source, mesh, methods=["kNN"], keep=True, **SMALL))
-    assert "error" not in [value for _, value in one.colors.options]
-    assert one.scenes[1].title == "kNN"
-    one.scenes[1].picked = {"vertex": 3, "count": 1}
-    assert "error" not in one.scenes[1].caption
-    one.close()
+    shown = Comparison(compare(source, mesh, methods=["kNN"], keep=True, **SMALL))
+    assert "error" not in [value for _, value in shown.colors.options]
+    assert shown.scenes[1].title == "kNN"
+    shown.scenes[1].picked = {"vertex": 3, "count": 1}
+    assert "error" not in shown.scenes[1].caption
+    shown.close()
 
 
-def test_methods_that_are_not_there_are_refused(found):
+def test_unknown_methods_are_refused(comparison):
     with pytest.raises(
         ValueError, match="methods must be 1 to 7 of kNN, RE-MATCH, registered surface, truth"
     ):
-        Comparison(found, methods=["ZO"])
+        Comparison(comparison, methods=["ZO"])
     with pytest.raises(ValueError, match="methods must be 1 to 7"):
-        Comparison(found, methods=["kNN"] * 8)
+        Comparison(comparison, methods=["kNN"] * 8)
 
 
-def test_the_result_of_the_command_can_be_shown(found, tmp_path):
-    found.to_netcdf(tmp_path / "compare.nc", engine="h5netcdf")
+def test_the_result_of_the_command_can_be_shown(comparison, tmp_path):
+    comparison.to_netcdf(tmp_path / "compare.nc", engine="h5netcdf")
     with xr.open_datatree(tmp_path / "compare.nc", engine="h5netcdf") as opened:
         panel = Comparison(opened, methods=["registered surface"])
         assert panel.scenes[1].title.startswith("registered surface, error")

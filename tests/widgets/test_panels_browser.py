@@ -1,4 +1,4 @@
-"""The panels beside the tabs, in a real JupyterLab: as wide as their cells, and clicked.
+"""The panels other than the tabs, in a real JupyterLab: as wide as their cells, and clicked.
 
 Also as pages without a kernel.
 """
@@ -82,7 +82,7 @@ def page(browser, lab, messages):
     page = watched(browser.new_page(viewport={"width": 1920, "height": 1080}), messages)
     page.set_default_timeout(60_000)
     run_notebook(page, lab, "panels.ipynb")
-    page.keyboard.press("Control+b")  # the files beside the notebook go
+    page.keyboard.press("Control+b")  # hide the files next to the notebook
     n = 2 * len(KINDS)
     page.wait_for_function(f"document.querySelectorAll('.s4a-panel').length === {n}", timeout=2e5)
     page.wait_for_function(IDLE)
@@ -128,7 +128,7 @@ UNSAID = """(panel) => {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_control_says_what_it_is_and_no_two_say_the_same(page, kind):
+def test_every_control_has_its_own_name_and_tooltip(page, kind):
     assert panel_of(page, kind, wide=True).evaluate(UNSAID) == []
 
 
@@ -145,7 +145,7 @@ def test_every_text_of_every_panel_is_read_in_every_theme(page, theme):
     check_themes(page, theme, panels, 5)
 
 
-def test_a_level_makes_the_map_grey_and_a_click_tells_the_values(page):
+def test_a_level_makes_the_map_grey_and_a_click_shows_the_values(page):
     panel = panel_of(page, "Maps", wide=True)
     canvas = views(panel).first
     before = pixels(canvas)
@@ -167,7 +167,7 @@ def test_the_controls_of_a_region_stand_in_one_row_of_a_wide_screen(page):
     assert np.ptp(middles) < 10
 
 
-def test_a_lasso_tells_python_what_is_within_it(page):
+def test_python_gets_the_vertices_inside_a_lasso(page):
     panel = panel_of(page, "Region", wide=True)
     canvas = views(panel).first
     before, box = pixels(canvas), canvas.bounding_box()
@@ -228,12 +228,12 @@ def test_the_page_of_structures_has_every_level_and_no_control_that_does_nothing
 
 def test_the_page_of_a_region_says_that_drawing_needs_python(show, study):
     page = show(Region(study))
-    assert "drawing a region" in page.locator(".note:not(#not-kept)").inner_text()
+    assert "drawing a region" in page.locator(".note:not(#not-recorded)").inner_text()
     assert page.get_by_text("lasso").count() == 0
     assert barriers(page) == []
 
 
-def test_the_numbers_beside_bars_are_not_cut_in_a_narrow_panel(show, study):
+def test_the_numbers_of_bars_are_not_cut_in_a_narrow_panel(show, study):
     page = show(Median(study))
     svg = visible(page, "svg.s4a-chart").first
 

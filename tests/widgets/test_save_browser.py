@@ -51,7 +51,7 @@ two = pytest.mark.parametrize("page", ["FunctionalMap"], indirect=True)
 
 
 @modes
-def test_a_picture_of_4k_has_surface_and_colour_bar_on_the_chosen_ground(page):
+def test_a_picture_of_4k_has_surface_and_colour_bar_on_the_given_background(page):
     with Image.open(io.BytesIO(downloaded(page, "Save picture", width="3840"))) as picture:
         assert picture.width == 3840
         small = picture.convert("RGBA").resize((384, picture.height // 10))
@@ -61,7 +61,7 @@ def test_a_picture_of_4k_has_surface_and_colour_bar_on_the_chosen_ground(page):
     assert 0.1 < (surface.min(-1) < 250).mean() < 0.9
     bar = reddest(Image.fromarray(np.asarray(small)[-40:]))
     assert bar.min() < -60 < 60 < bar.max()
-    content = downloaded(page, "Save picture", width="600", ground="")
+    content = downloaded(page, "Save picture", width="600", background="")
     with Image.open(io.BytesIO(content)) as picture:
         opacity = np.asarray(picture)[..., 3]
     assert (opacity[0, 0], opacity.max()) == (0, 255)
@@ -96,7 +96,7 @@ def test_a_film_of_a_slider_goes_from_one_end_to_the_other_and_back(page):
 @two
 def test_both_surfaces_of_a_panel_turn_once_in_one_film(page):
     page.get_by_label("surfaces").select_option("all")
-    with Image.open(io.BytesIO(downloaded(page, "Save film", transform="turn"))) as film:
+    with Image.open(io.BytesIO(downloaded(page, "Save film", motion="turn"))) as film:
         frames = []
         for i in (0, 25):
             film.seek(i)

@@ -130,7 +130,7 @@ def body(picture):
     return picture.min(2) < 245
 
 
-def test_a_slider_deforms_the_surface_and_sends_nothing_until_it_is_let_go(page):
+def test_a_slider_deforms_the_surface_and_sends_nothing_until_it_is_released(page):
     slider = page.locator(".s4a-scores input").first
     before = seen(page, MODES)
     sent = len(page.sent)
@@ -217,7 +217,7 @@ def test_landmarks_are_drawn_and_a_light_of_ones_own_shines_on_the_surface(page)
     assert lit.mean() > 0.03, "cyan"
 
 
-def test_lines_join_the_two_surfaces_of_a_correspondence(page):
+def test_segments_join_the_two_surfaces_of_a_correspondence(page):
     picture = seen(page, PAIR)
     columns = body(picture).any(0)
     covered = np.nonzero(columns)[0]
@@ -230,7 +230,7 @@ def green(picture):
     return (picture[..., 1] - picture[..., 0] > 30) & (picture[..., 1] - picture[..., 2] > 30)
 
 
-def test_the_network_shows_its_shapes_and_lines_in_the_colours_of_their_errors(page):
+def test_the_network_shows_its_nodes_and_edges_in_the_colours_of_their_errors(page):
     picture = seen(page, NETWORK)
     clay = body(picture) & (np.ptp(picture, axis=2) < 40) & (picture.min(2) > 80)
     assert clay.mean() > 0.03

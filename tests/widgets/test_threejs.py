@@ -56,22 +56,22 @@ def test_a_field_has_the_colours_of_its_values():
 
 
 def shader(mesh, row, scores):
-    """What the vertex shader adds up for one vertex: its place, and its normal."""
+    """The sums of the vertex shader at a vertex: its position and normal."""
     uniforms = {name: value["value"] for name, value in mesh.material.uniforms.items()}
     table = uniforms["table"].data.reshape(-1, 4)
     n_modes = int(mesh.material.defines["MODES"])
-    place = mesh.geometry.attributes["position"].array[row].astype(float)
+    position = mesh.geometry.attributes["position"].array[row].astype(float)
     normal = mesh.geometry.attributes["normal"].array[row].astype(float)
     for mode, score in enumerate(scores):
         texel = table[row * n_modes + mode]
         number = int(texel[3])
         steps = np.array([number % 256, number // 256 % 256, number // 65536])
-        place += score * texel[:3]
+        position += score * texel[:3]
         normal += score * uniforms["bends"][mode] * (steps - 127) / 127
-    return place, normal / np.linalg.norm(normal)
+    return position, normal / np.linalg.norm(normal)
 
 
-def test_the_table_holds_places_and_normals_of_the_modes(study):
+def test_the_table_holds_positions_and_normals_of_the_modes(study):
     mesh = threejs.modes(study)
     n_modes = study["pca"].sizes["component"]
     scores = np.array([1.0, -0.7, 0.5])[:n_modes]
@@ -80,8 +80,8 @@ def test_the_table_holds_places_and_normals_of_the_modes(study):
     normals = vertex_normals(X, T)
     turned = []
     for row in range(0, len(X), 7):
-        place, normal = shader(mesh, row, scores)
-        np.testing.assert_allclose(place, X[row], atol=1e-4 * np.abs(X).max())
+        position, normal = shader(mesh, row, scores)
+        np.testing.assert_allclose(position, X[row], atol=1e-4 * np.abs(X).max())
         turned.append(normal @ normals[row])
     assert np.quantile(turned, 0.05) > 0.97
     still = threejs.modes(study).geometry.attributes["normal"].array[::7]
@@ -123,7 +123,7 @@ def test_too_many_modes_for_a_texture_are_refused():
         threejs.mode_table(np.zeros((1_000_000, 3)), None, np.broadcast_to(0, (9, 1_000_000, 3)))
 
 
-def test_landmarks_stand_where_they_are_with_their_names(meshes):
+def test_landmarks_are_spheres_with_their_names(meshes):
     mesh = meshes["brain_01"]
     group = threejs.points(mesh)
     assert [ball.name for ball in group.children] == mesh["landmark_name"].values.tolist()
@@ -160,16 +160,18 @@ def test_a_study_matches_two_of_its_shapes(study):
     X, Y = (part.geometry.attributes["position"].array for part in (left, right))
     colors = [part.geometry.attributes["color"].array for part in (left, right)]
     nearest = cdist(Y - Y.mean(0), X - X.mean(0)).argmin(1)
-    assert np.abs(colors[1] - colors[0][nearest]).mean() < 0.1, "the same places, the same colours"
+    assert np.abs(colors[1] - colors[0][nearest]).mean() < 0.1, (
+        "corresponding points have one colour"
+    )
 
 
-def test_the_network_stands_where_its_differences_are_and_is_coloured_by_its_errors(study):
+def test_the_network_is_placed_by_shape_differences_and_coloured_by_cycle_errors(study):
     group = threejs.network(study, names=False)
     *bodies, lines = group.children
     scores = study["latent"]["area_score"]
     assert [part.name for part in bodies] == scores["shape"].values.tolist()
-    places = np.array([part.position for part in bodies])
-    ratio = pdist(places) / pdist(scores.values[:, :3])
+    positions = np.array([part.position for part in bodies])
+    ratio = pdist(positions) / pdist(scores.values[:, :3])
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-6)
     net = study["network"].dataset
     names = [part.name for part in bodies]
@@ -182,12 +184,12 @@ def test_the_network_stands_where_its_differences_are_and_is_coloured_by_its_err
     limits = np.min(both), np.max(both)
     assert (group.bar["low"], group.bar["high"]) == limits
     for segment, color in zip(lines.geometry.positions, lines.geometry.colors, strict=True):
-        ends = [names[np.linalg.norm(places - end, axis=1).argmin()] for end in segment]
+        ends = [names[np.linalg.norm(positions - end, axis=1).argmin()] for end in segment]
         error = np.mean(mean[frozenset(ends)])
         np.testing.assert_allclose(color, cycle_error_colors(np.full(2, error), limits), atol=1e-6)
 
 
-def test_the_bar_of_a_network_stands_below_it_and_moves_with_the_camera(study):
+def test_the_colour_bar_of_a_network_is_below_it_and_moves_with_the_camera(study):
     group = threejs.network(study)
     scene = threejs.renderer(group, size=(400, 300), view="top")
     assert not [part for part in threejs.renderer(group.children[0]).camera.children if part.name]
@@ -228,7 +230,7 @@ def test_the_camera_sees_the_surface():
 
 
 @pytest.mark.parametrize("size", [(360, 200), (500, 500), (300, 600)])
-def test_what_is_long_fills_the_picture_and_nothing_is_cut(size):
+def test_a_long_object_fills_the_picture_and_nothing_is_cut(size):
     long = synthetic.ellipsoid(500, (6, 1, 1))
     view = threejs.renderer(threejs.surface(long), size=size, view="front")
     X = long["position"].values

@@ -10,7 +10,7 @@ pytestmark = needed
 pytest.importorskip("playwright.sync_api")
 
 WIDTH, HEIGHT = 390, 844
-CAMERA = "(c) => ({ turn: [...c.view.camera.turn], zoom: c.view.camera.zoom })"
+CAMERA = "(c) => ({ rotation: [...c.view.camera.rotation], zoom: c.view.camera.zoom })"
 PICKED = "(c, [x, y]) => c.view.pick({ clientX: x, clientY: y })?.point"
 
 
@@ -69,10 +69,10 @@ def surface(matches):
     return canvas, np.array([box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
 
 
-def test_one_finger_scrolls_the_page_until_it_is_told_to_turn(matches, surface):
+def test_one_finger_scrolls_the_page_until_it_is_set_to_rotate(matches, surface):
     canvas, middle = surface
     before = canvas.evaluate(CAMERA)
-    button = matches.get_by_role("button", name="one finger turns the surface").first
+    button = matches.get_by_role("button", name="one finger rotates the surface").first
 
     def drag():
         touch(matches, (middle + [0, 60], middle - [0, 120]))
@@ -86,7 +86,11 @@ def test_one_finger_scrolls_the_page_until_it_is_told_to_turn(matches, surface):
     matches.evaluate("scrollTo(0, 0)")
     tap("true")
     matches.evaluate("scrollTo(0, 0)")
-    settled(matches, lambda: not np.allclose(canvas.evaluate(CAMERA)["turn"], before["turn"]), drag)
+    settled(
+        matches,
+        lambda: not np.allclose(canvas.evaluate(CAMERA)["rotation"], before["rotation"]),
+        drag,
+    )
     assert matches.evaluate("scrollY") == 0
     tap("false")
 
@@ -106,7 +110,7 @@ def test_what_two_fingers_hold_stays_under_them(matches, surface):
     def held_under_them():
         after = canvas.evaluate(CAMERA)
         assert after["zoom"] == pytest.approx(2 * before["zoom"], rel=0.02)
-        assert after["turn"] == before["turn"]
+        assert after["rotation"] == before["rotation"]
         there = canvas.evaluate(PICKED, end.tolist())
         np.testing.assert_allclose(there, held, atol=0.02 * size)
 

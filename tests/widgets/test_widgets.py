@@ -59,8 +59,8 @@ def panel(study):
         return made[-1]
 
     yield make
-    for one in made:
-        one.close()
+    for widget in made:
+        widget.close()
     assert len(registry._instances) == before
 
 
@@ -104,7 +104,7 @@ def test_without_webgl_a_still_picture_is_sent():
     view.close()
 
 
-def test_a_still_picture_looks_from_where_the_view_stands():
+def test_a_still_picture_has_the_direction_of_the_view():
     X, T = tetrahedron()
     pictures = []
     for direction in ("front", "top"):
@@ -228,7 +228,7 @@ def test_a_clicked_node_shows_its_mesh_alone(study, panel):
     assert network.scenes[1].layout.display == "none"
 
 
-def test_the_edge_budget_tells_how_the_network_hangs_together(panel):
+def test_the_edge_budget_shows_the_connectivity(panel):
     network = panel(Network)
     assert "6 pairs" in network.facts.value
     network.budget.value = 3
@@ -261,15 +261,15 @@ def test_edges_are_coloured_before_and_after_on_one_scale(study, panel):
     np.testing.assert_allclose(np.sort(drawn, axis=0), np.sort(colors, axis=0), atol=1 / 255)
 
 
-def test_the_colours_of_cycle_errors_tell_maps_apart_that_differ_by_a_tenth():
+def test_cycle_errors_that_differ_by_a_tenth_have_different_colours():
     before, after = np.array([0.056, 0.062, 0.080]), np.array([0.0355, 0.039])  # as in lesson 00
     limits = cycle_error_limits(before, after)
     assert limits == (0.0355, 0.080)
     colors = [255 * cycle_error_colors(errors, limits) for errors in (before, after)]
     for several in colors:
         assert np.linalg.norm(np.diff(several, axis=0), axis=1).min() > 15
-    gaps = np.abs(np.subtract.outer(*(several.sum(1) for several in colors)))
-    assert gaps.min() > 15, "both stages on one scale"
+    distances = np.abs(np.subtract.outer(*(several.sum(1) for several in colors)))
+    assert distances.min() > 15, "both stages on one scale"
 
 
 def with_network(study, network):
@@ -294,7 +294,7 @@ def test_the_first_pairs_are_those_of_the_study_and_others_are_chosen_as_it_does
         network.close()
 
 
-def test_maps_of_unknown_error_are_grey_and_said_to_be_in_no_cycle(study):
+def test_maps_of_unknown_error_are_grey_and_labelled_in_no_cycle(study):
     maps = study["network"].to_dataset()
     maps["cycle_error"] = maps["cycle_error"].where(np.arange(maps.sizes["pair"]) != 3)
     network = Network(with_network(study, maps))
@@ -322,7 +322,7 @@ def test_two_shapes_have_a_network_without_cycles(study):
     network.close()
 
 
-def test_zoomout_is_replayed_as_the_step_module_does_it(study, panel):
+def test_zoomout_is_that_of_the_step_module(study, panel):
     fmap = panel(FunctionalMap, pair=1)
     fmap.kind.value = "zoomout"
     row = study["network"].dataset.isel(pair=1)
@@ -348,7 +348,7 @@ def test_a_clicked_cell_shows_the_two_eigenfunctions(study, panel):
 # ---- median, correspondence, spectrum
 
 
-def test_bars_are_the_stored_distances_in_rising_order(study, panel):
+def test_bars_are_the_stored_distances_in_ascending_order(study, panel):
     median = panel(Median)
     latent = study["latent"].dataset
     np.testing.assert_allclose(
@@ -361,7 +361,7 @@ def test_bars_are_the_stored_distances_in_rising_order(study, panel):
     assert "rank 3 of 4" in median.scene.caption
 
 
-def test_the_median_can_be_ranked_by_other_operators_norms_and_modes(study, panel):
+def test_the_median_can_be_ranked_by_other_operators_norms_and_sizes(study, panel):
     median = panel(Median)
     values = median.bars.spec["values"]
     median.operator.value, median.size.value = "conformal", 12
@@ -374,7 +374,7 @@ def test_the_median_can_be_ranked_by_other_operators_norms_and_modes(study, pane
     assert "The median is" in median.ties.value
 
 
-def test_points_are_carried_there_and_back(study, panel):
+def test_points_are_mapped_in_both_directions(study, panel):
     both = panel(Correspondence)
     match = study["registration"]["registered_match"].sel(shape=both.shape).values
     both.scenes[0].picked = {"vertex": 17, "count": 1}
@@ -387,7 +387,7 @@ def test_points_are_carried_there_and_back(study, panel):
     assert both.image == 40
 
 
-def test_two_shapes_are_matched_by_way_of_the_template(study, panel):
+def test_two_shapes_are_matched_through_the_template(study, panel):
     both = panel(Correspondence)
     template, source, shape = both.template, *both.names[:2]
     both.source, both.shape = source, shape
@@ -395,7 +395,7 @@ def test_two_shapes_are_matched_by_way_of_the_template(study, panel):
     X, Y = both.pair[0][0], both.pair[1][0]
     assert len(X) == study["original"][source].sizes["vertex"]
     there, back = both.match(), both.reverse_match()
-    # a vertex of the template, carried to both shapes, is one place
+    # a vertex of the template, transferred to both shapes, is one point
     on_source, on_shape = (registered.sel(shape=name).values for name in (source, shape))
     size = np.ptp(Y, axis=0).max()
     assert np.median(np.linalg.norm(Y[there[on_source]] - Y[on_shape], axis=1)) < 0.02 * size
@@ -440,8 +440,8 @@ def test_the_checkerboard_is_evaluated_from_the_templates_coordinates(study, pan
     assert (template == study["registration"]["position"].values.astype(np.float32)).all()
     node = study["registration"][both.shape]
     corners = study["registration"]["corner_vertex"].values[node["template_triangle"].values]
-    carried = np.einsum("vc,vcx->vx", node["template_barycentric"].values, template[corners])
-    np.testing.assert_allclose(shape, carried, atol=1e-3)
+    transferred = np.einsum("vc,vcx->vx", node["template_barycentric"].values, template[corners])
+    np.testing.assert_allclose(shape, transferred, atol=1e-3)
     assert both.scenes[0].cell == both.scenes[1].cell > 0
     both.map.value = "low"
     template, shape = (floats(view.coordinate) for view in both.scenes)
@@ -475,7 +475,7 @@ def test_landmarks_are_spheres_of_a_radius_in_the_datas_unit(panel):
     assert (colors[4:] == [1, 0, 0]).all()
 
 
-def test_labels_and_landmarks_are_carried_as_the_step_module_does_it(study, panel, tmp_path):
+def test_labels_and_landmarks_are_transferred_as_by_the_step_module(study, panel, tmp_path):
     both = panel(Transfer)
     source, target = both.source, both.target
     mesh = study["original"][source].to_dataset()
@@ -557,13 +557,13 @@ def test_landmarks_that_were_placed_stay_until_another_source_is_chosen(panel, t
     assert "mine" not in both.marks
 
 
-def test_a_saved_page_leaves_the_point_that_was_picked(panel, tmp_path):
+def test_saving_a_page_keeps_the_picked_point(panel, tmp_path):
     both = panel(Correspondence)
     both.scenes[0].picked = {"vertex": 5, "count": 1}
 
     def picked():
-        told = [(scene.points, scene.caption) for scene in both.scenes]
-        return both.vertex, both.image, told
+        shown = [(scene.points, scene.caption) for scene in both.scenes]
+        return both.vertex, both.image, shown
 
     before = picked()
     assert before[0] == 5
@@ -572,7 +572,7 @@ def test_a_saved_page_leaves_the_point_that_was_picked(panel, tmp_path):
     assert text.count(before[2][0][1]) >= 2
 
 
-def test_nothing_is_said_of_labels_that_are_not_shown(study, panel):
+def test_there_is_no_caption_for_hidden_labels(study, panel):
     both = panel(Transfer)
     assert both.scenes[1].caption.startswith("labels transferred from ")
     both.labels.value = False
@@ -589,9 +589,9 @@ def test_nothing_is_said_of_labels_that_are_not_shown(study, panel):
     bare.close()
 
 
-def test_the_spectrum_shows_every_shape_beside_weyls_line(study, panel):
+def test_the_spectrum_shows_every_shape_and_weyls_law(study, panel):
     spectrum = panel(Spectrum)
-    series = {one["name"]: one["y"] for one in spectrum.curves.spec["series"]}
+    series = {curve["name"]: curve["y"] for curve in spectrum.curves.spec["series"]}
     for name in study["coarse"].children:
         np.testing.assert_allclose(series[name], study["coarse"][name]["eigenvalue"].values)
     assert series["Weyl: 4 π k"][1] == pytest.approx(4 * np.pi)
@@ -606,15 +606,15 @@ def test_the_spectrum_shows_every_shape_beside_weyls_line(study, panel):
 # ---- many shapes
 
 
-def test_of_many_shapes_the_graph_has_those_near_the_one_that_is_shown(panel, monkeypatch):
+def test_of_many_shapes_the_graph_has_those_near_the_selected_shape(panel, monkeypatch):
     whole = panel(Network)
     monkeypatch.setattr(network_module, "MOST", 3)
     network = panel(Network)
-    one = next(name for name in network.names if name != network.median)
-    network.node = one
+    other = next(name for name in network.names if name != network.median)
+    network.node = other
     spec = network.graph.spec
     assert len(spec["names"]) == 3 < len(network.names)
-    assert {one, network.median} <= set(spec["names"])
+    assert {other, network.median} <= set(spec["names"])
     assert f"(the nearest 3 of {len(network.names)})" in spec["title"]
     ends = [[spec["names"][i] for i in spec[key]] for key in ("source", "target")]
     assert ends == [[names[e] for e in spec["edges"]] for names in (network.source, network.target)]
@@ -625,7 +625,7 @@ def test_of_many_shapes_the_graph_has_those_near_the_one_that_is_shown(panel, mo
     assert network.message.value == ""
 
 
-def test_of_many_shapes_the_spectra_are_a_part_and_the_chosen_one(panel, monkeypatch):
+def test_of_many_shapes_some_spectra_and_the_selected_one_are_drawn(panel, monkeypatch):
     monkeypatch.setattr(spectrum_module, "MOST", 2)
     spectrum = panel(Spectrum)
     spectrum.shape = spectrum.names[1]
@@ -672,7 +672,7 @@ def test_an_analysis_shows_its_progress_and_its_panels(tmp_path):
     assert len(registry._instances) == before
 
 
-def test_a_failed_analysis_says_why(tmp_path):
+def test_a_failed_analysis_shows_the_error(tmp_path):
     panel = Progress({"one": tetrahedron()}, tmp_path / "study", n_jobs=1)
     assert ended(panel) == "failed"
     assert "at least 2" in panel.message.value
@@ -701,7 +701,7 @@ def test_a_resumed_analysis_is_not_called_cancelled(tmp_path):
     panel.close()
 
 
-def test_who_is_left_out_is_told(tmp_path):
+def test_shapes_left_out_are_listed(tmp_path):
     collection = s4a.synthetic.brains(3, 500, seed=1)
     meshes = collection["original"].children.items()
     shapes = {name: mesh.to_dataset() for name, mesh in meshes}
@@ -715,7 +715,7 @@ def test_who_is_left_out_is_told(tmp_path):
 # ---- all of it
 
 
-def test_a_cell_that_runs_again_closes_the_tabs_of_its_run_before(study, monkeypatch):
+def test_a_cell_that_runs_again_closes_its_previous_tabs(study, monkeypatch):
     before = len(registry._instances)
     shell = InteractiveShell()
     monkeypatch.setattr(explore_module, "get_ipython", lambda: shell)
@@ -750,7 +750,7 @@ def test_no_cell_runs_outside_of_a_notebook():
     assert explore_module.running_cell() is None
 
 
-def test_tabs_are_built_when_opened_and_leave_nothing(study):
+def test_tabs_are_built_when_opened_and_closed_without_remains(study):
     before = len(registry._instances)
     for _ in range(2):
         tabs = study.s4a.explore()
@@ -786,7 +786,7 @@ def test_a_pair_is_chosen_in_all_tabs_that_are_opened_before_or_later(study, mon
     drawn = drawings(tabs, monkeypatch)
     assert tabs["Functional map"] is maps  # opened before
     assert maps.names() == (source, target)
-    assert drawn == 2 * ["Functional map"], "one time on each surface, and no other tab"
+    assert drawn == 2 * ["Functional map"], "once on each surface, and no other tab"
     both = tabs["Correspondence"]  # opened later
     assert {both.source, both.shape} == {source, target}
     assert tabs.pair == (source, target), "the direction stays"
@@ -820,7 +820,7 @@ def test_every_pair_of_a_network_is_shown_by_all_tabs_without_a_loop(study):
     tabs.close()
 
 
-def test_a_page_of_one_panel_chooses_nothing_in_the_other_tabs(study, tmp_path):
+def test_a_page_of_one_panel_does_not_change_the_other_tabs(study, tmp_path):
     tabs = Explore(study)
     network = tabs["Network"]
     chosen = tabs.pair, tabs.shape
@@ -852,7 +852,7 @@ def test_a_shape_is_chosen_in_all_tabs(study):
     tabs.close()
 
 
-def test_an_unfinished_study_says_what_is_missing(study):
+def test_the_tabs_of_an_unfinished_study_show_what_is_missing(study):
     started = xr.DataTree.from_dict(
         {f"coarse/{n}": c.to_dataset() for n, c in study["coarse"].children.items()}
     )
@@ -899,7 +899,7 @@ def test_of_an_inserted_shape_every_tab_is_shown_that_has_its_stage(inserted, ca
     tabs.close()
 
 
-def test_labels_of_the_template_are_carried_to_an_inserted_shape(inserted, tmp_path):
+def test_labels_of_the_template_are_transferred_to_an_inserted_shape(inserted, tmp_path):
     both = Transfer(inserted)
     template = inserted["registration"].attrs["template"]
     assert (both.source, both.target) == (template, "brain_07")
@@ -918,7 +918,7 @@ def test_a_correspondence_has_no_map_for_which_the_template_lacks_its_low_resolu
     both.close()
 
 
-def test_a_shape_that_nothing_can_be_carried_to_is_told(inserted):
+def test_a_study_without_a_second_shape_is_refused(inserted):
     template = inserted["registration"].attrs["template"]
     nodes = {node.path: node.to_dataset(inherit=False) for node in inserted.subtree}
     del nodes[f"/original/{template}"]
@@ -936,7 +936,7 @@ def test_errors_in_callbacks_are_shown_and_logged(panel, caplog):
     assert caplog.records
 
 
-def test_a_page_needs_nothing_from_elsewhere(panel, tmp_path):
+def test_a_page_is_self_contained(panel, tmp_path):
     for kind in (Modes, Network, FunctionalMap, Median, Correspondence, Transfer, Spectrum):
         text = panel(kind).save_html(tmp_path / "page.html").read_text(encoding="utf-8")
         links = set(re.findall(r"(?:src|href)=[\"']?([^\"'> ]{1,12})|https?://[^\"'` )]+", text))
@@ -951,7 +951,7 @@ def recording(text):
     return json.loads(re.search(r'id="recording">(.*?)</script>', text, re.DOTALL)[1])
 
 
-def test_a_page_keeps_what_python_shows_for_every_value_of_its_controls(study, panel, tmp_path):
+def test_a_page_records_the_output_for_every_value_of_its_controls(study, panel, tmp_path):
     fmap = panel(FunctionalMap, pair=3)
     before = fmap.matrix.values, fmap.scenes[0].color
     data = recording(fmap.save_html(tmp_path / "page.html").read_text(encoding="utf-8"))
@@ -961,18 +961,18 @@ def test_a_page_keeps_what_python_shows_for_every_value_of_its_controls(study, p
     order = [labels[i] for i in group["controls"]]
     slot = next(i for i, (_, name, key) in enumerate(group["slots"]) if name == "values")
     choice = {"c-k": fmap.k.options.index(15), "c-kind": 1, "c-block": 0, "c-choice": 7}
-    kept = data["values"][group["rows"][",".join(str(choice[name]) for name in order)][slot]]
+    recorded = data["values"][group["rows"][",".join(str(choice[name]) for name in order)][slot]]
     fmap.pair, fmap.kind.value, fmap.k.value = 7, "zoomout", 15
-    assert base64.b64decode(json.loads(kept)["base64"]) == fmap.matrix.values
+    assert base64.b64decode(json.loads(recorded)["base64"]) == fmap.matrix.values
 
 
-def test_a_full_page_says_what_it_does_not_keep(panel, tmp_path):
+def test_a_full_page_lists_what_is_not_recorded(panel, tmp_path):
     path = panel(Spectrum).save_html(tmp_path / "page.html", limit=60_000)
     text = path.read_text(encoding="utf-8")
     data = recording(text)
     shapes = next(control for control in data["controls"] if control["id"] == "c-choice")
     assert shapes["open"] == [0]
-    assert "Needs Python" in text
+    assert "Only in a notebook" in text
     assert "changing shape" in text
 
 

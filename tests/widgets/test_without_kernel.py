@@ -126,9 +126,9 @@ def test_a_click_on_what_a_saved_page_did_not_keep_says_so(browser, study, tmp_p
     page = browser.new_page()
     page.goto(path.as_uri())
     page.wait_for_selector("canvas.s4a-view")
-    said = page.locator("#not-kept")
-    assert said.inner_text() == ""
+    texts = page.locator("#not-recorded")
+    assert texts.inner_text() == ""
     other = next(name for name in study["coarse"].children if name != panel.shape.value)
     page.locator(f"rect.s4a-mark[aria-label^='{other}:']").dispatch_event("click")
-    assert said.inner_text().startswith(f"{other} is not kept in this page")
+    assert texts.inner_text().startswith(f"{other} is not recorded in this page")
     page.close()

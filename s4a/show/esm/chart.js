@@ -1,5 +1,5 @@
-// Charts in SVG whose marks can be hovered, clicked and reached with the arrow keys. Every function takes a parent
-// element, a spec (plain numbers and names) and `pick`, which is called with the mark that was chosen.
+// SVG charts whose marks can be hovered, clicked and reached with the arrow keys. Every function takes a parent element,
+// a spec (numbers and names) and `pick`, which is called with the selected mark.
 
 const BLUE = "#0072b2", ORANGE = "#d55e00", INK = "#333", FAINT = "#ddd", PALE = "#bbb";
 
@@ -17,35 +17,34 @@ function bounds(values, margin = 0.08) {
   return [low - pad, high + pad];
 }
 
-// The width of a chart in its own unit, a thirteenth of the text's size: that of its parent, up to `most`. The text of a
-// chart is of one size at every width.
-function room(parent, most, least = 230) {
-  const look = getComputedStyle(parent), inner = parent.clientWidth - parseFloat(look.paddingLeft) - parseFloat(look.paddingRight);
-  return inner > 0 ? Math.min(most, Math.max(least, Math.round((13 * inner) / (parseFloat(look.fontSize) || 13)))) : most;
+// The width of a chart in 1/13 of the font size: that of its parent, up to `most`. So all charts have one font size.
+function availableWidth(parent, most, least = 230) {
+  const style = getComputedStyle(parent), inner = parent.clientWidth - parseFloat(style.paddingLeft) - parseFloat(style.paddingRight);
+  return inner > 0 ? Math.min(most, Math.max(least, Math.round((13 * inner) / (parseFloat(style.fontSize) || 13)))) : most;
 }
 const atMost = (svg, width) => (svg.style.maxWidth = `calc(${width} / 13 * var(--s4a-size, 13px))`);
 
-// Calls `act` when the room of a parent is another one.
-function onRoom(parent, act) {
-  let last = room(parent, 1e4);
+// Call `act` when the width of a parent changes.
+function onResize(parent, act) {
+  let last = availableWidth(parent, 1e4);
   const observer = new ResizeObserver(() => {
-    const now = room(parent, 1e4);
+    const now = availableWidth(parent, 1e4);
     if (parent.clientWidth && Math.abs(now - last) > 2) { last = now; act(); }
   });
   observer.observe(parent);
   return () => observer.disconnect();
 }
 
-// As many ticks as their texts have room for side by side.
-function fewer(range, room) {
+// As many ticks as fit without overlap of their texts.
+function fewer(range, length) {
   for (let count = 6; count > 1; count--) {
-    const found = ticks(...range, count), wide = 7 * Math.max(...found.map((t) => short(t).length)) + 6;
-    if (wide * (found.length - 1) <= room || found.length < 3) return found;
+    const candidates = ticks(...range, count), width = 7 * Math.max(...candidates.map((t) => short(t).length)) + 6;
+    if (width * (candidates.length - 1) <= length || candidates.length < 3) return candidates;
   }
   return ticks(...range, 1);
 }
 
-// A drawing of the given size with both axes; gives the scales.
+// Draw both axes at a given size; return the scales.
 function plot(parent, { width, height, x, y, xlabel = "", ylabel = "", title = "", left = 48, grid = true }) {
   const svg = node(parent, "svg", { viewBox: `0 0 ${width} ${height}`, class: "s4a-chart", role: "group", "aria-label": title });
   atMost(svg, width);
@@ -66,38 +65,38 @@ function plot(parent, { width, height, x, y, xlabel = "", ylabel = "", title = "
   return { svg, X, Y, left, right, top, bottom };
 }
 
-// Names as short as they can be told apart: what all share at both ends is left out where one is long.
-function brief(names, room = 16) {
-  if (Math.max(...names.map((name) => name.length)) <= room) return names;
-  const shared = (texts) => {
+// Shorten names that are too long, and omit their common prefix and suffix.
+function shortened(names, length = 16) {
+  if (Math.max(...names.map((name) => name.length)) <= length) return names;
+  const common = (texts) => {
     let n = 0;
     while (texts.every((text) => n < text.length && text[n] === texts[0][n])) n++;
     return texts[0].slice(0, n).match(/^(.*[_\W])?/s)[0].length; // up to a separator
   };
-  const start = shared(names), stop = shared(names.map((name) => [...name.slice(start)].reverse().join("")));
+  const start = common(names), stop = common(names.map((name) => [...name.slice(start)].reverse().join("")));
   return names.map((name) => {
     const text = `${start ? "…" : ""}${name.slice(start, name.length - stop)}${stop ? "…" : ""}`;
-    return text.length <= room ? text : `${text.slice(0, room / 2 - 1)}…${text.slice(-room / 2)}`;
+    return text.length <= length ? text : `${text.slice(0, length / 2 - 1)}…${text.slice(-length / 2)}`;
   });
 }
 
-// Names beside their marks, each where it hides nothing; one that finds no place is left to the hover and the focus.
-function labels(svg, { x, y, names, width, height, start = 0, sides, avoid = [], letter = 6.4, gap = 7, ...look }) {
+// Write names next to their marks where they overlap nothing; the others are shown on hover and focus.
+function labels(svg, { x, y, names, width, height, start = 0, sides, avoid = [], letter = 6.4, distance = 7, ...style }) {
   const taken = [...x.map((v, i) => [v - 6, y[i] - 6, v + 6, y[i] + 6]), ...avoid.map(([v, w]) => [v - 8, w - 8, v + 8, w + 8])];
-  brief(names).forEach((text, i) => {
-    const wide = letter * text.length;
+  shortened(names).forEach((text, i) => {
+    const textWidth = letter * text.length;
     for (const [right, down] of sides ? sides(i) : [[1, -4], [-1, -4], [1, 12], [-1, 12]]) {
-      const left = right > 0 ? x[i] + gap : x[i] - gap - wide, low = y[i] + down, box = [left, low - 9, left + wide, low + 2];
+      const left = right > 0 ? x[i] + distance : x[i] - distance - textWidth, low = y[i] + down, box = [left, low - 9, left + textWidth, low + 2];
       if (box[0] < start || box[2] > width || box[1] < 0 || box[3] > height) continue;
       if (taken.some((other, j) => j !== i && box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) continue;
       taken.push(box);
-      node(svg, "text", { x: x[i] + right * gap, y: low, "text-anchor": right > 0 ? "start" : "end", ...look }, text);
+      node(svg, "text", { x: x[i] + right * distance, y: low, "text-anchor": right > 0 ? "start" : "end", ...style }, text);
       return;
     }
   });
 }
 
-// Makes marks focusable: one tab stop, the arrow keys go on, Enter picks; the text of a mark is read out below.
+// Make marks focusable: one tab stop, arrow keys for the others, Enter picks; the text of a mark is shown below.
 function reachable(marks, readout, pick) {
   marks.forEach(({ at, text, value }, i) => {
     at.setAttribute("tabindex", i ? -1 : 0);
@@ -106,12 +105,12 @@ function reachable(marks, readout, pick) {
     at.dataset.mark = JSON.stringify(value);
     at.classList.add("s4a-mark");
     node(at, "title", {}, text);
-    const say = () => (readout.textContent = text);
-    at.addEventListener("pointerenter", say);
+    const show = () => (readout.textContent = text);
+    at.addEventListener("pointerenter", show);
     at.addEventListener("focus", () => {
       marks.forEach((other) => other.at.setAttribute("tabindex", -1));
       at.setAttribute("tabindex", 0);
-      say();
+      show();
     });
     at.addEventListener("click", () => pick(value));
     at.addEventListener("keydown", (e) => {
@@ -125,8 +124,8 @@ function reachable(marks, readout, pick) {
   });
 }
 
-// Draws anew what is in a parent; the focus stays on the mark that had it, or goes to the first one where that is gone.
-function redrawn(parent, draw) {
+// Redraw the content of a parent; the focus stays on its mark, or moves to the first one if that is gone.
+function keepFocus(parent, draw) {
   const last = parent.getRootNode().activeElement; // of the page, or of a shadow tree
   const within = parent.contains(last);
   draw();
@@ -138,13 +137,13 @@ function redrawn(parent, draw) {
 const line = (parent) => html(parent, "div", { class: "s4a-readout", "aria-live": "polite" }, " ");
 
 function scatter(parent, spec, pick) {
-  const { x, y, names, xlabel, ylabel, title, selected = -1, faint = [], width = room(parent, spec.most ?? 430) } = spec, { height = Math.min(300, width) } = spec;
+  const { x, y, names, xlabel, ylabel, title, selected = -1, faint = [], width = availableWidth(parent, spec.most ?? 430) } = spec, { height = Math.min(300, width) } = spec;
   const frame = plot(parent, { width, height, x: bounds([...x, ...(spec.reach || [0])]), y: bounds([...y, ...(spec.reach || [0])]), xlabel, ylabel, title });
   const marks = x.map((_, i) => {
     const at = node(frame.svg, "circle", { cx: frame.X(x[i]), cy: frame.Y(y[i]), r: i === selected ? 7 : 5, fill: i === selected ? ORANGE : faint[i] ? PALE : BLUE, stroke: "#fff" });
     return { at, value: { index: i, name: names[i] }, text: `${names[i]}${faint[i] ? " (flagged)" : ""}: ${short(x[i])}, ${short(y[i])}` };
   });
-  labels(frame.svg, { x: x.map(frame.X), y: y.map(frame.Y), names, width, height: frame.bottom, start: frame.left, avoid: [[frame.X(0), frame.Y(0)]], class: "s4a-small" }); // where the cross is at first
+  labels(frame.svg, { x: x.map(frame.X), y: y.map(frame.Y), names, width, height: frame.bottom, start: frame.left, avoid: [[frame.X(0), frame.Y(0)]], class: "s4a-small" }); // the initial position of the cross
   const cross = node(frame.svg, "path", { d: "M-7 0H7M0 -7V7", stroke: ORANGE, "stroke-width": 2, visibility: "hidden", class: "s4a-cross" });
   reachable(marks, line(parent), pick);
   return (a, b) => {
@@ -154,16 +153,16 @@ function scatter(parent, spec, pick) {
 }
 
 function bars(parent, spec, pick) {
-  const { values, names, label, title, marked = [], selected = -1, width = room(parent, 430) } = spec, told = brief(names);
-  const row = values.length > 25 ? 15 : 20, height = 26 + row * values.length + 40, left = 10 + 6.5 * Math.max(...told.map((n) => n.length), 4);
-  const numbers = alike(values), beside = 8 + 7 * Math.max(...numbers.map((n) => n.length)), wide = width - 10 - left; // of the longest bar and its number
-  const frame = plot(parent, { width, height, left, x: [0, (Math.max(...values) * wide) / Math.max(wide - beside, 1) || 1], y: [0, 1], xlabel: label, title, grid: false });
+  const { values, names, label, title, marked = [], selected = -1, width = availableWidth(parent, 430) } = spec, shortNames = shortened(names);
+  const row = values.length > 25 ? 15 : 20, height = 26 + row * values.length + 40, left = 10 + 6.5 * Math.max(...shortNames.map((n) => n.length), 4);
+  const numbers = sameDecimals(values), numberWidth = 8 + 7 * Math.max(...numbers.map((n) => n.length)), barWidth = width - 10 - left; // of the longest bar with its number
+  const frame = plot(parent, { width, height, left, x: [0, (Math.max(...values) * barWidth) / Math.max(barWidth - numberWidth, 1) || 1], y: [0, 1], xlabel: label, title, grid: false });
   frame.svg.querySelectorAll("text[text-anchor=end]").forEach((t) => t.remove());
   const marks = values.map((v, i) => {
     const top = frame.top + 2 + i * row;
     const at = node(frame.svg, "rect", { x: left, y: top, width: Math.max(1, frame.X(v) - left), height: row - 4, fill: marked.includes(i) ? ORANGE : BLUE });
     if (i === selected) Object.entries({ stroke: INK, "stroke-width": 2.5 }).forEach(([k, s]) => at.setAttribute(k, s));
-    node(frame.svg, "text", { x: left - 4, y: top + row - 8, "text-anchor": "end" }, told[i]);
+    node(frame.svg, "text", { x: left - 4, y: top + row - 8, "text-anchor": "end" }, shortNames[i]);
     node(frame.svg, "text", { x: frame.X(v) + 4, y: top + row - 8 }, numbers[i]);
     return { at, value: { index: i, name: names[i] }, text: `${names[i]}: ${v.toPrecision(4)}` };
   });
@@ -171,7 +170,7 @@ function bars(parent, spec, pick) {
 }
 
 function lines(parent, spec, pick) {
-  const { series, xlabel, ylabel, title, width = room(parent, 460), ymin, marker } = spec, { height = Math.min(280, width) } = spec;
+  const { series, xlabel, ylabel, title, width = availableWidth(parent, 460), ymin, marker } = spec, { height = Math.min(280, width) } = spec;
   const y = bounds(series.flatMap((s) => s.y), 0.04);
   const frame = plot(parent, { width, height, x: bounds(series.flatMap((s) => s.x), 0.02), y: [ymin ?? y[0], y[1]], xlabel, ylabel, title });
   const drawn = series.map((s) => {
@@ -182,10 +181,10 @@ function lines(parent, spec, pick) {
     if (s.dots) s.x.forEach((v, i) => node(at, "circle", { cx: frame.X(v), cy: frame.Y(s.y[i]), r: 3.2 }));
     return { path, at, chosen: s.wide, reference: s.reference, value: { series: s.name }, text: s.text || s.name };
   });
-  for (const { path, at, chosen } of drawn) if (chosen) frame.svg.append(path, at); // over the others
-  const told = series.filter((s) => s.legend), below = Boolean(spec.legend);
-  told.forEach((s, i) => {
-    const x0 = spec.legend === "bottom" ? frame.right - 130 : frame.left + 10, y0 = below ? frame.bottom - 15 * (told.length - i) : frame.top + 10 + 15 * i;
+  for (const { path, at, chosen } of drawn) if (chosen) frame.svg.append(path, at); // above the others
+  const legend = series.filter((s) => s.legend), below = Boolean(spec.legend);
+  legend.forEach((s, i) => {
+    const x0 = spec.legend === "bottom" ? frame.right - 130 : frame.left + 10, y0 = below ? frame.bottom - 15 * (legend.length - i) : frame.top + 10 + 15 * i;
     node(frame.svg, "line", { x1: x0, x2: x0 + 24, y1: y0, y2: y0, stroke: s.color || BLUE, "stroke-width": 2, "stroke-dasharray": s.dash || "" });
     node(frame.svg, "text", { x: x0 + 30, y: y0 + 4, class: "s4a-halo" }, s.name);
   });
@@ -194,15 +193,15 @@ function lines(parent, spec, pick) {
 }
 
 function graph(parent, spec, pick) {
-  const { x, y, names, source, target, colors, values, weights, title, edges, highlight = -1, faint = [], node: chosen = -1, edge = -1, width = room(parent, 460) } = spec, { height = Math.round(Math.min(390, Math.max(290, 0.87 * width))) } = spec;
+  const { x, y, names, source, target, colors, values, weights, title, edges, highlight = -1, faint = [], node: chosen = -1, edge = -1, width = availableWidth(parent, 460) } = spec, { height = Math.round(Math.min(390, Math.max(290, 0.87 * width))) } = spec;
   const svg = node(parent, "svg", { viewBox: `0 0 ${width} ${height}`, class: "s4a-chart", role: "group", "aria-label": title });
   atMost(svg, width);
   node(svg, "text", { x: 8, y: 14, "font-weight": "bold" }, title);
   const [x0, x1] = bounds(x, 0), [y0, y1] = bounds(y, 0);
-  const edgeRoom = 20 + 6.4 * Math.max(...brief(names).map((n) => n.length));
-  const X = x.map((v) => edgeRoom + ((v - x0) / (x1 - x0 || 1)) * (width - 2 * edgeRoom)), Y = y.map((v) => height - 25 - ((v - y0) / (y1 - y0 || 1)) * (height - 75));
-  const marks = source.map((s, i) => { // the two directions of a pair bend to either side
-    const t = target[i], dx = X[t] - X[s], dy = Y[t] - Y[s], bend = spec.both === false ? 0 : 0.06;
+  const margin = 20 + 6.4 * Math.max(...shortened(names).map((n) => n.length));
+  const X = x.map((v) => margin + ((v - x0) / (x1 - x0 || 1)) * (width - 2 * margin)), Y = y.map((v) => height - 25 - ((v - y0) / (y1 - y0 || 1)) * (height - 75));
+  const marks = source.map((s, i) => { // the two directions of a pair are curved to either side
+    const t = target[i], dx = X[t] - X[s], dy = Y[t] - Y[s], bend = spec.bidirectional === false ? 0 : 0.06;
     const d = `M${X[s]} ${Y[s]}Q${(X[s] + X[t]) / 2 - bend * dy} ${(Y[s] + Y[t]) / 2 + bend * dx} ${X[t]} ${Y[t]}`;
     const at = node(svg, "g", { fill: "none", class: "s4a-edge", "data-edge": i });
     node(at, "path", { d, stroke: "transparent", "stroke-width": 7 });
@@ -219,11 +218,11 @@ function graph(parent, spec, pick) {
     node(at, "circle", { cx: X[i], cy: Y[i], r: 8, fill: i === chosen ? ORANGE : faint[i] ? PALE : INK, stroke: "#fff" });
     return { at, value: { node: name }, text: `${name}${i === highlight ? ", the median" : ""}${faint[i] ? " (flagged)" : ""}` };
   }));
-  const sides = (i) => { // names stand outside of the ring
+  const sides = (i) => { // names are outside of the circle
     const out = X[i] < width / 2 - 20 ? -1 : 1, down = Y[i] < height / 2 ? -5 : 13;
     return [[out, down], [out, 4], [-out, down]];
   };
-  labels(svg, { x: X, y: Y, names, width, height, sides, letter: 6.4, gap: 12, class: "s4a-halo" });
+  labels(svg, { x: X, y: Y, names, width, height, sides, letter: 6.4, distance: 12, class: "s4a-halo" });
   reachable([...marks.slice(source.length), ...marks.slice(0, source.length)], line(parent), pick);
 }
 
@@ -252,7 +251,7 @@ function matrix(parent, spec, pick) {
   colorBar(html(frame, "div", { class: "s4a-matrix-bar" }), { colors, low: -limit, label: "entry of the matrix", high: limit });
   html(parent, "div", { class: "s4a-note" }, note);
   const inside = (at) => at.row >= 0 && at.row < rows && at.column < columns;
-  const canvas = html(box, "canvas", { tabindex: 0, role: "application", "aria-label": `${[title, axes[0] && `columns: ${axes[0]}, rows: ${axes[1]}`].filter(Boolean).join("; ")}: arrow keys move, Enter shows the cell` });
+  const canvas = html(box, "canvas", { tabindex: 0, role: "application", "aria-label": `${[title, axes[0] && `columns: ${axes[0]}, rows: ${axes[1]}`].filter(Boolean).join("; ")}: arrow keys move, Enter selects the entry` });
   Object.assign(canvas, { width: columns, height: rows });
   const paint = canvas.getContext("2d"), image = paint.createImageData(columns, rows);
   values.forEach((v, i) => {
@@ -265,7 +264,7 @@ function matrix(parent, spec, pick) {
   const cursor = node(svg, "rect", { width: 1, height: 1, fill: "none", stroke: "#000", "stroke-width": columns / 150, x: column, y: row, visibility: inside({ row, column }) ? "visible" : "hidden" });
   const readout = line(parent), here = inside({ row, column }) ? { row, column } : { row: 0, column: 0 };
   const say = () => (readout.textContent = `C[${here.row}, ${here.column}] = ${short(values[here.row * columns + here.column])}   (${label(here)})`);
-  const place = (e) => {
+  const follow = (e) => {
     const r = canvas.getBoundingClientRect();
     here.column = Math.min(columns - 1, Math.max(0, Math.floor(((e.clientX - r.left) / r.width) * columns)));
     here.row = Math.min(rows - 1, Math.max(0, Math.floor(((e.clientY - r.top) / r.height) * rows)));
@@ -275,8 +274,8 @@ function matrix(parent, spec, pick) {
     Object.entries({ x: here.column, y: here.row, visibility: "visible" }).forEach(([k, v]) => cursor.setAttribute(k, v));
     pick({ ...here });
   };
-  canvas.addEventListener("pointermove", place);
-  canvas.addEventListener("click", (e) => { place(e); choose(); });
+  canvas.addEventListener("pointermove", follow);
+  canvas.addEventListener("click", (e) => { follow(e); choose(); });
   canvas.addEventListener("keydown", (e) => {
     const step = { ArrowRight: [0, 1], ArrowLeft: [0, -1], ArrowDown: [1, 0], ArrowUp: [-1, 0] }[e.key];
     if (!step && e.key !== "Enter") return;

@@ -1,6 +1,6 @@
-// Small helpers of all scripts.
+// Helpers of all scripts.
 
-// Bytes from the kernel as numbers; copied, because they may begin at any place in their buffer.
+// Bytes from the kernel as numbers; copied, because their offset in the buffer may not be aligned.
 const numbers = (Kind, view) =>
   view && view.byteLength ? new Kind(view.buffer.slice(view.byteOffset, view.byteOffset + view.byteLength)) : null;
 
@@ -20,13 +20,13 @@ function html(parent, tag, attributes = {}, text = "") {
   return it;
 }
 
-// What has the focus in here keeps its keys: Notebook 7 would take the arrow keys for its cells, before the page sees them.
+// The focused element keeps its keys: Notebook 7 would use the arrow keys for its cells before the page gets them.
 const ownKeys = (box) => box.addEventListener("focusin", ({ target }) => target.setAttribute("data-lm-suppress-shortcuts", "true"));
 
 const short = (x) => (x === null || x === undefined || Number.isNaN(x) ? "none" : String(Number(x.toPrecision(3))));
 
-// Numbers in a column, with as many decimals as the one that needs most.
-function alike(values) {
+// Format the numbers of a column with the same number of decimals.
+function sameDecimals(values) {
   const texts = values.map(short), decimals = Math.max(...texts.map((text) => (/^-?[0-9.]+$/.test(text) ? text.split(".")[1] || "" : "").length));
   return texts.map((text, i) => (/^-?[0-9.]+$/.test(text) ? values[i].toFixed(decimals) : text));
 }

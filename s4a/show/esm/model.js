@@ -1,4 +1,4 @@
-// What a script needs of the notebook's model, without a notebook: the state of a page, and events of changes.
+// A replacement of the notebook's model in a page without kernel: the state and change events.
 globalThis.s4aValue = (text) => JSON.parse(text, (key, value) => {
   if (!value || typeof value.base64 !== "string") return value;
   const letters = atob(value.base64), bytes = new Uint8Array(letters.length);
@@ -7,14 +7,14 @@ globalThis.s4aValue = (text) => JSON.parse(text, (key, value) => {
 });
 globalThis.s4aModels = {};
 globalThis.s4aModel = (id) => {
-  const state = s4aValue(document.getElementById(id + "-state").textContent), heard = {};
-  const tell = (name) => [...(heard["change:" + name] || [])].forEach((act) => act());
+  const state = s4aValue(document.getElementById(id + "-state").textContent), listeners = {};
+  const notify = (name) => [...(listeners["change:" + name] || [])].forEach((act) => act());
   return (s4aModels[id] = {
     get: (name) => state[name],
-    set: (name, value) => { state[name] = value; tell(name); },
-    update: (changes) => { Object.assign(state, changes); Object.keys(changes).forEach(tell); },
-    on: (event, act) => { (heard[event] ||= []).push(act); },
-    off: (event, act) => { heard[event] = (heard[event] || []).filter((other) => other !== act); },
+    set: (name, value) => { state[name] = value; notify(name); },
+    update: (changes) => { Object.assign(state, changes); Object.keys(changes).forEach(notify); },
+    on: (event, act) => { (listeners[event] ||= []).push(act); },
+    off: (event, act) => { listeners[event] = (listeners[event] || []).filter((other) => other !== act); },
     save_changes: () => {},
     saved: true,
   });

@@ -1,4 +1,4 @@
-// The mean shape moved along its modes, wholly in the browser: p = mean + sum of score times deformation.
+// The mean shape deformed in the browser along the modes of variation: mean + sum of score times deformation.
 class Modes {
   constructor(model) {
     this.model = model;
@@ -10,7 +10,7 @@ class Modes {
     this.corner = numbers(Uint32Array, get("corner"));
     this.deformation = numbers(Float32Array, get("deformation"));
     this.normal = normalsOf(this.mean, this.corner);
-    this.reach = this.far(3);
+    this.reach = this.radiusAt(3);
     this.palettes = { normal: numbers(Uint8Array, get("signed_palette")), magnitude: numbers(Uint8Array, get("ramp_palette")) };
     this.own = numbers(Uint8Array, get("own"));
     this.limits = { normal: get("limit"), magnitude: get("limit_magnitude") };
@@ -24,18 +24,18 @@ class Modes {
     });
     return out;
   }
-  // How far from the mean's centre each mode alone takes the surface, at so many standard deviations to either side.
-  far(sigma) {
+  // The radius around the mean's centre that contains the surface at ± sigma of each mode.
+  radiusAt(sigma) {
     const M = this.mean, D = this.deformation, centre = boxOf(M).centre;
     let r2 = 0;
     for (let start = 0; start < D.length; start += M.length) {
       for (let i = 0; i < M.length; i += 3) {
-        let there = 0, along = 0, moved = 0;
+        let start2 = 0, along = 0, moved2 = 0;
         for (let x = 0; x < 3; x++) {
           const p = M[i + x] - centre[x], d = sigma * D[start + i + x];
-          there += p * p; along += p * d; moved += d * d;
+          start2 += p * p; along += p * d; moved2 += d * d;
         }
-        r2 = Math.max(r2, there + 2 * Math.abs(along) + moved);
+        r2 = Math.max(r2, start2 + 2 * Math.abs(along) + moved2);
       }
     }
     return Math.sqrt(r2);
@@ -66,21 +66,21 @@ function modesWidget({ model, el }) {
   el.classList.add("s4a");
   ownKeys(el);
   const modes = new Modes(model), ratio = model.get("ratio"), count = ratio.length, range = 3;
-  let current = [...model.get("scores")]; // ahead of the model's while a slider moves
+  let current = [...model.get("scores")]; // newer than the model's scores while a slider moves
   const scores = () => [...current];
   const box = html(el, "div", { class: "s4a-modes" }), left = html(box, "div"), right = html(box, "div");
   const views = html(left, "div", { class: "s4a-views" }), bar = html(left, "div"), still = html(left, "img", { class: "s4a-still", hidden: "" });
   let active = 0, shown = [], timer = 0, playing = 0, crosshair = null;
   el.modes = modes;
 
-  const tell = (name, value) => { model.set(name, value); model.save_changes(); };
+  const send = (name, value) => { model.set(name, value); model.save_changes(); };
   const set = (values, last = active) => {
     active = last;
     current = [...values];
     update();
-    timer ||= setTimeout(() => { timer = 0; tell("scores", current); }, 100); // ten messages a second at most
+    timer ||= setTimeout(() => { timer = 0; send("scores", current); }, 100); // at most ten messages a second
   };
-  const told = () => { // an answer to an earlier message must not move the slider back
+  const onScores = () => { // an answer to an earlier message must not reset the slider
     if (timer || model.get("scores").every((s, c) => s === current[c])) return;
     current = [...model.get("scores")];
     update();
@@ -91,26 +91,26 @@ function modesWidget({ model, el }) {
     it.addEventListener("click", act);
     return it;
   };
-  button("Reset", () => set(scores().fill(0)), "all scores to 0: the mean shape");
-  const play = button("Play", () => toggle(), "moves the marked mode back and forth");
-  const threeButton = button("−3 · mean · +3", () => tell("side_by_side", !model.get("side_by_side")), "the marked mode at both ends, side by side");
+  button("Reset", () => set(scores().fill(0)), "set all scores to 0: the mean shape");
+  const play = button("Play", () => toggle(), "animate the selected mode");
+  const threeButton = button("−3 · mean · +3", () => send("side_by_side", !model.get("side_by_side")), "show the selected mode at −3 and +3 standard deviations side by side");
   button("Random", () => set(scores().map(() => {
-    let z = range + 1; // one normal number each, those beyond the sliders drawn again
+    let z = range + 1; // normally distributed scores within the range of the sliders
     while (Math.abs(z) > range) z = Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());
     return Math.round(100 * z) / 100;
-  })), "a plausible shape: scores drawn from the normal distribution");
-  const kinds = html(buttons, "select", { "aria-label": "colours", title: "colour: how far a place moved from the mean, along its normal or at all" });
-  for (const [value, text] of [["normal", "along the normal"], ["magnitude", "distance"], ["none", "no colours"], ...(model.get("own")?.byteLength ? [["own", "of each part"]] : [])]) html(kinds, "option", { value }, text);
-  kinds.addEventListener("change", () => tell("colors", kinds.value));
+  })), "draw scores from the normal distribution: a plausible shape");
+  const kinds = html(buttons, "select", { "aria-label": "colours", title: "colours: displacement from the mean, along the normals or its length" });
+  for (const [value, text] of [["normal", "along the normal"], ["magnitude", "distance"], ["none", "no colours"], ...(model.get("own")?.byteLength ? [["own", "by structure"]] : [])]) html(kinds, "option", { value }, text);
+  kinds.addEventListener("change", () => send("colors", kinds.value));
   const sliders = html(right, "div", { class: "s4a-sliders" });
   const rows = ratio.map((share, c) => {
-    const row = html(sliders, "label", { class: "s4a-slider", title: `component ${c + 1}: ${(100 * share).toFixed(1)} % of the variance; the slider is its score, in standard deviations (σ)` });
-    html(row, "span", {}, `PC${c + 1} · ${(100 * share).toFixed(1)} %`);
-    const input = html(row, "input", { type: "range", min: -range, max: range, step: 0.05, "aria-label": `component ${c + 1} in standard deviations` });
+    const row = html(sliders, "label", { class: "s4a-slider", title: `mode ${c + 1}: ${(100 * share).toFixed(1)} % of the variance; the slider is its score, in standard deviations (σ)` });
+    html(row, "span", {}, `mode ${c + 1} · ${(100 * share).toFixed(1)} %`);
+    const input = html(row, "input", { type: "range", min: -range, max: range, step: 0.05, "aria-label": `mode ${c + 1} in standard deviations` });
     const output = html(row, "output", {}, "0.00");
     input.addEventListener("input", () => { const s = scores(); s[c] = Number(input.value); set(s, c); });
     input.addEventListener("focus", () => { active = c; mark(); });
-    input.addEventListener("keydown", (e) => e.stopPropagation()); // where the notebook hears keys after the slider
+    input.addEventListener("keydown", (e) => e.stopPropagation()); // not for the notebook
     return { row, input, output };
   });
   const distance = html(right, "div", { class: "s4a-readout", "aria-live": "polite" });
@@ -132,18 +132,18 @@ function modesWidget({ model, el }) {
     };
     playing = requestAnimationFrame(step);
   };
-  // What a film shows: the marked mode from one end to the other, the others as they stand.
+  // A film of the selected mode from one end to the other; the other scores do not change.
   const filmed = new Surface();
   const slider = () => ({
-    name: `PC${active + 1} from −${range} to +${range} σ`, ends: [-range, range],
+    name: `mode ${active + 1} from −${range} to +${range} σ`, ends: [-range, range],
     at: (score) => {
       const s = scores().map((other, c) => (c === active ? score : other));
       modes.show(filmed, s, model.get("colors"));
       shown[0].widen(filmed.position);
-      return { title: said(s), surfaces: [filmed] };
+      return { title: scoreText(s), surfaces: [filmed] };
     },
   });
-  const said = (s) => s.map((score, c) => (score ? `PC${c + 1} ${score < 0 ? "−" : "+"}${Math.abs(score).toFixed(1)} σ` : "")).filter(Boolean).join(", ") || "mean";
+  const scoreText = (s) => s.map((score, c) => (score ? `mode ${c + 1} ${score < 0 ? "−" : "+"}${Math.abs(score).toFixed(1)} σ` : "")).filter(Boolean).join(", ") || "mean";
   const arrange = () => {
     shown.forEach((view) => view.dispose());
     views.replaceChildren();
@@ -152,10 +152,10 @@ function modesWidget({ model, el }) {
     box.classList.toggle("s4a-side-by-side", three);
     shown = (three ? [-range, 0, range] : [null]).map((at) => {
       const part = html(views, "div"), caption = html(part, "div", { class: "s4a-title" });
-      const view = new View(part, { turn: model.get("turn"), group: model.get("group"), height: model.get("height"), label: "shape" });
+      const view = new View(part, { rotation: model.get("rotation"), group: model.get("group"), height: model.get("height"), label: "shape" });
       view.surfaces = [new Surface()];
       view.fit(modes.mean, modes.reach);
-      const heading = () => (at === null ? said(scores()) : caption.textContent), bar = () => model.get("bars")[model.get("colors")];
+      const heading = () => (at === null ? scoreText(scores()) : caption.textContent), bar = () => model.get("bars")[model.get("colors")];
       return Object.assign(view, { at, caption, heading, bar, slider: at === null ? slider : undefined });
     });
     update();
@@ -167,7 +167,7 @@ function modesWidget({ model, el }) {
       if (!context()) return;
       modes.show(view.surfaces[0], shape(view.at), kind);
       view.widen(view.surfaces[0].position);
-      view.caption.textContent = view.at === null ? "mean + Σ score · deformation" : view.at ? `PC${active + 1} at ${view.at > 0 ? "+" : "−"}3 σ` : "mean";
+      view.caption.textContent = view.at === null ? "mean + Σ score · deformation" : view.at ? `mode ${active + 1} at ${view.at > 0 ? "+" : "−"}3 σ` : "mean";
       view.name(view.at === null ? "shape" : view.caption.textContent);
       view.redraw();
     });
@@ -177,8 +177,8 @@ function modesWidget({ model, el }) {
     });
     mark();
     kinds.value = kind;
-    const far = Math.hypot(...s);
-    distance.textContent = `Mahalanobis distance ${far.toFixed(2)} (about ${Math.sqrt(count).toFixed(1)} is usual for a random shape)`;
+    const mahalanobis = Math.hypot(...s);
+    distance.textContent = `Mahalanobis distance ${mahalanobis.toFixed(2)} (about ${Math.sqrt(count).toFixed(1)} for a random shape)`;
     colorBar(bar, model.get("bars")[kind]);
     crosshair?.(s[0], s[1] ?? 0);
   };
@@ -192,11 +192,11 @@ function modesWidget({ model, el }) {
       s.x = s.y.map((_, i) => i + 1);
       s.text = `${s.name}: ${s.y.map((v, i) => `${i + 1}: ${v.toFixed(1)} %`).slice(0, 12).join(", ")}`;
     });
-    if (ratio.length > 1) lines(variancePart, { series, title: "Cumulative variance", xlabel: "number of components", ylabel: "%", ymin: 0, legend: "bottom" }, () => {});
+    if (ratio.length > 1) lines(variancePart, { series, title: "Explained variance", xlabel: "number of modes", ylabel: "%", ymin: 0, legend: "bottom" }, () => {});
     crosshair = scatter(scorePart, {
       x: samples.map((s) => s[0]), y: samples.map((s) => s[1] ?? 0), names, title: "Scores: click a shape to see it",
-      faint: model.get("faint"), xlabel: "PC1 (σ)", ylabel: count > 1 ? "PC2 (σ)" : "", most: 460, reach: [-range, range],
-    }, ({ index }) => { tell("sample", index); set(samples[index]); });
+      faint: model.get("faint"), xlabel: "mode 1 (σ)", ylabel: count > 1 ? "mode 2 (σ)" : "", most: 460, reach: [-range, range],
+    }, ({ index }) => { send("sample", index); set(samples[index]); });
   };
   const picture = () => {
     const bytes = numbers(Uint8Array, model.get("still"));
@@ -204,13 +204,13 @@ function modesWidget({ model, el }) {
   };
   const reload = () => { modes.load(); arrange(); };
   const on = {
-    "change:scores": told, "change:colors": update, "change:side_by_side": arrange, "change:deformation": reload, "change:corner": () => { modes.load(); update(); }, "change:own": () => { modes.load(); update(); },
-    "change:still": picture, "change:turn": () => shown[0].reset(model.get("turn")),
+    "change:scores": onScores, "change:colors": update, "change:side_by_side": arrange, "change:deformation": reload, "change:corner": () => { modes.load(); update(); }, "change:own": () => { modes.load(); update(); },
+    "change:still": picture, "change:rotation": () => shown[0].reset(model.get("rotation")),
   };
   Object.entries(on).forEach(([event, act]) => model.on(event, act));
   chart();
   arrange();
-  const stop = onRoom(scorePart, () => { redrawn(charts, chart); update(); });
+  const stop = onResize(scorePart, () => { keepFocus(charts, chart); update(); });
   const webgl = context() !== null;
   views.hidden = !webgl;
   still.hidden = webgl;

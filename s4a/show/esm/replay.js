@@ -1,5 +1,5 @@
-// The controls of a page without Python: what it showed for their values was recorded, and is shown again.
-// {controls: [{id, labels, at, open}], values: [...], groups: [{controls, slots: [[id, name, key]], rows}], clicks: [...]}
+// The controls of a page without Python: they show the recorded output for their values.
+// {controls: [{id, labels, at, recorded}], values: [...], groups: [{controls, slots: [[id, name, key]], rows}], clicks: [...]}
 globalThis.s4aReplay = ({ controls, values, groups, clicks }) => {
   const value = (i) => (typeof values[i] === "string" ? s4aValue(values[i]) : values[i]);
   const inputs = controls.map((control) => document.getElementById(control.id));
@@ -23,22 +23,22 @@ globalThis.s4aReplay = ({ controls, values, groups, clicks }) => {
       s4aModels[id]?.update(state);
     }
   };
-  const said = document.getElementById("not-kept");
+  const note = document.getElementById("not-recorded");
   const choose = (c, at) => {
-    const kept = controls[c].open.includes(at);
-    said.textContent = kept ? "" : `${controls[c].labels[at]} is not kept in this page; a notebook shows it.`;
-    if (controls[c].at === at || !kept) return;
+    const isRecorded = controls[c].recorded.includes(at);
+    note.textContent = isRecorded ? "" : `${controls[c].labels[at]} is not recorded in this page; a notebook shows it.`;
+    if (controls[c].at === at || !isRecorded) return;
     controls[c].at = at;
-    inputs[c].value = inputs[c].type === "range" ? controls[c].open.indexOf(at) : at;
+    inputs[c].value = inputs[c].type === "range" ? controls[c].recorded.indexOf(at) : at;
     if (inputs[c].type === "checkbox") inputs[c].checked = Boolean(at);
-    const told = inputs[c].parentElement.querySelector("output");
-    if (told) told.textContent = controls[c].labels[at];
+    const output = inputs[c].parentElement.querySelector("output");
+    if (output) output.textContent = controls[c].labels[at];
     if (inputs[c].type === "range") inputs[c].setAttribute("aria-valuetext", controls[c].labels[at]);
     apply(c);
   };
   inputs.forEach((input, c) => input.addEventListener("input", () => {
     const at = input.type === "checkbox" ? Number(input.checked) : Number(input.value);
-    choose(c, input.type === "range" ? controls[c].open[at] : at);
+    choose(c, input.type === "range" ? controls[c].recorded[at] : at);
   }));
   for (const { id, part, control } of clicks) {
     s4aModels[id].on("change:picked", () => {

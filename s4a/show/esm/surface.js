@@ -1,19 +1,19 @@
-// Surfaces in the browser. One WebGL2 context draws all surfaces of the page, and each view is a plain canvas to which
-// its picture is copied: any number of views, in any number of cells, costs one context.
+// Surfaces in the browser. One WebGL2 context draws all surfaces of the page, and the picture of a view is copied to its
+// canvas, so that any number of views needs one context.
 
 const VERTEX = `#version 300 es
 in vec3 position, normal, color, coordinate;
-uniform mat3 turn;
+uniform mat3 rotation;
 uniform vec3 centre;
-uniform vec4 place, ball;
+uniform vec4 viewport, ball;
 uniform float depth;
 out vec3 n, c, q;
 void main() {
-  vec3 p = turn * ((ball.w > 0.0 ? ball.xyz + ball.w * position : position) - centre);
-  n = turn * normal;
+  vec3 p = rotation * ((ball.w > 0.0 ? ball.xyz + ball.w * position : position) - centre);
+  n = rotation * normal;
   c = color;
   q = coordinate;
-  gl_Position = vec4(p.xy * place.xy + place.zw, -p.z * depth, 1.0);
+  gl_Position = vec4(p.xy * viewport.xy + viewport.zw, -p.z * depth, 1.0);
 }`;
 const FRAGMENT = `#version 300 es
 precision highp float;
@@ -22,22 +22,22 @@ uniform float opacity, cell;
 out vec4 pixel;
 void main() {
   vec3 base = c;
-  if (cell > 0.0) { // a checkerboard of cubes in the space of the coordinates that the surface carries
+  if (cell > 0.0) { // a checkerboard of cubes in the space of the given coordinates
     vec3 at = floor(q / cell);
     base *= mod(at.x + at.y + at.z, 2.0) < 0.5 ? 1.0 : 0.5;
   }
   vec3 N = normalize(n) * (gl_FrontFacing ? 1.0 : -1.0);
   vec3 key = normalize(vec3(-0.42, 0.55, 0.72));
   float wrap = clamp((dot(N, key) + 0.3) / 1.3, 0.0, 1.0), sky = 0.5 + 0.5 * N.y;
-  float rim = pow(clamp(1.0 - N.z, 0.0, 1.0), 3.0);
+  float silhouette = pow(clamp(1.0 - N.z, 0.0, 1.0), 3.0);
   float gloss = pow(clamp(dot(N, normalize(key + vec3(0.0, 0.0, 1.0))), 0.0, 1.0), 40.0);
-  vec3 lit = base * (0.45 + 0.15 * sky + 0.52 * wrap) * (1.0 - 0.35 * rim) + 0.10 * gloss;
+  vec3 lit = base * (0.45 + 0.15 * sky + 0.52 * wrap) * (1.0 - 0.35 * silhouette) + 0.10 * gloss;
   pixel = vec4(clamp(lit, 0.0, 1.0) * opacity, opacity);
 }`;
 const CLAY = [0.8, 0.76, 0.7];
 const ATTRIBUTES = ["position", "normal", "color", "coordinate"];
 
-// The unit sphere, whose vertices are their own normals.
+// The unit sphere: the normals are the vertices.
 function ballMesh(rings = 10, around = 16) {
   const P = [], T = [];
   for (let i = 0; i <= rings; i++) for (let j = 0; j < around; j++) {
@@ -56,7 +56,7 @@ function shader(gl, kind, source) {
   return it;
 }
 
-// The page's context, made at first use and made again after it was lost; null where there is no WebGL2.
+// The context of the page, created at first use and again if it is lost; null without WebGL2.
 function context() {
   const old = globalThis.s4aContext;
   if (old === null || (old && !old.gl.isContextLost())) return old;
@@ -69,12 +69,12 @@ function context() {
   gl.linkProgram(program);
   gl.useProgram(program);
   const at = {};
-  for (const name of ["turn", "centre", "place", "depth", "opacity", "ball", "cell"]) at[name] = gl.getUniformLocation(program, name);
+  for (const name of ["rotation", "centre", "viewport", "depth", "opacity", "ball", "cell"]) at[name] = gl.getUniformLocation(program, name);
   gl.enable(gl.DEPTH_TEST);
   return (globalThis.s4aContext = { gl, at });
 }
 
-// Normals of the vertices: the sum of the area vectors of the triangles around, at unit length.
+// Normals of the vertices: the normalised sum of the area vectors of the adjacent triangles.
 function normalsOf(P, T, N = new Float32Array(P.length)) {
   N.fill(0);
   for (let t = 0; t < T.length; t += 3) {
@@ -122,19 +122,19 @@ class Surface {
     this.stale = true;
   }
   faceOf(vertex) { return Math.floor(this.corner.indexOf(vertex) / 3); }
-  neighbours(vertex) { // from a table of the corners at every vertex, made at first use
+  neighbours(vertex) { // from a table of the corners at every vertex, created at first use
     if (!this.ring) {
       const start = new Uint32Array(this.position.length / 3 + 1), T = this.corner;
       for (const v of T) start[v + 1]++;
       for (let v = 1; v < start.length; v++) start[v] += start[v - 1];
-      const next = start.slice(), place = new Uint32Array(T.length);
-      T.forEach((v, i) => (place[next[v]++] = i));
-      this.ring = { start, place };
+      const next = start.slice(), corners = new Uint32Array(T.length);
+      T.forEach((v, i) => (corners[next[v]++] = i));
+      this.ring = { start, corners };
     }
-    const { start, place } = this.ring, found = new Set();
-    for (let i = start[vertex]; i < start[vertex + 1]; i++) for (let m = 0; m < 3; m++) found.add(this.corner[place[i] - (place[i] % 3) + m]);
-    found.delete(vertex);
-    return [...found];
+    const { start, corners } = this.ring, adjacent = new Set();
+    for (let i = start[vertex]; i < start[vertex + 1]; i++) for (let m = 0; m < 3; m++) adjacent.add(this.corner[corners[i] - (corners[i] % 3) + m]);
+    adjacent.delete(vertex);
+    return [...adjacent];
   }
   upload(on) {
     const { gl } = on;
@@ -168,7 +168,7 @@ class Surface {
     gl.uniform1f(at.cell, this.cell);
     gl.uniform4f(at.ball, ...(this.ball || [0, 0, 0, 0]));
     const triangles = () => gl.drawElements(gl.TRIANGLES, this.corner.length, gl.UNSIGNED_INT, 0);
-    if (this.opacity < 1) { // first the depth alone, so that only what is in front shines through
+    if (this.opacity < 1) { // first the depth alone, so that only the front is blended
       gl.colorMask(false, false, false, false);
       triangles();
       gl.colorMask(true, true, true, true);

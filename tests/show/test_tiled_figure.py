@@ -1,4 +1,4 @@
-"""Figures of parts: what a notebook shows of each, and the scale beside surfaces."""
+"""Tiled figures in a notebook, and the colour bar next to surfaces."""
 
 import base64
 import io
@@ -10,17 +10,19 @@ from PIL import Image
 
 import s4a
 from s4a.show import charts
-from s4a.show.parts import Parts
+from s4a.show.tiled_figure import TiledFigure
 
 
 def pictures(figure):
-    """The picture of each part (height, width, 3)."""
-    found = re.findall(r"base64,([^\"]+)", figure.html())
-    return [np.array(Image.open(io.BytesIO(base64.b64decode(one))).convert("RGB")) for one in found]
+    """The picture of each tile (height, width, 3)."""
+    encoded = re.findall(r"base64,([^\"]+)", figure.html())
+    return [
+        np.array(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")) for data in encoded
+    ]
 
 
-def test_no_part_shows_what_reaches_over_from_its_neighbour():
-    figure = Parts(figsize=(4, 2))
+def test_no_tile_shows_a_text_of_its_neighbour():
+    figure = TiledFigure(figsize=(4, 2))
     wide, plain = figure.subplots(1, 2)
     for ax in (wide, plain):
         ax.imshow(np.ones((4, 4)), cmap="gray", vmin=0, vmax=1)
@@ -32,7 +34,7 @@ def test_no_part_shows_what_reaches_over_from_its_neighbour():
     assert all(ax.get_visible() for ax in figure.axes)
 
 
-def test_no_part_is_cut_beside_longer_titles_and_a_scale():
+def test_no_tile_is_cut_next_to_long_titles_and_a_colour_bar():
     ball = s4a.synthetic.sphere(100)
     height = ball["position"].values[:, 2]
     titles = ["one", "two\nlines", "a title that is much wider than its ball"]
