@@ -32,7 +32,7 @@ import s4a_morphometrics
 from s4a.analysis.permutation import Model
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normals
 from s4a.schema import dataset
-from s4a_morphometrics.bilateral import antisymmetry_test, both_sides, sides_test
+from s4a_morphometrics.bilateral import antisymmetry_test, matching_sides, sides_test
 from s4a_morphometrics.bilateral_pairs import involution
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -151,11 +151,11 @@ def whole_rates(
 
     Shapes vary by `size` times as much; for `power` the bump is simulated in every fifth run.
     """
-    X, T, halves = surface
+    X, T, partners = surface
     height = np.exp(-((X - [1.7, 1.0, 0.6]) ** 2).sum(1) / 0.5)
     push, high = BUMP * height[:, None] * vertex_normals(X, T), height > 0.5
     names = [f"shape_{i:02d}" for i in range(n)]
-    options = {"halves": halves, "of": way, "n_permutations": N_PERMUTATIONS}
+    options = {"partners": partners, "of": way, "n_permutations": N_PERMUTATIONS}
     if way == "sides":
         options = {"subject": names * 2, "side": ["left"] * n + ["right"] * n}
         options["n_permutations"] = N_PERMUTATIONS
@@ -191,7 +191,7 @@ def humps(n: int, runs: int) -> float:
     said = np.empty(runs)
     for run in range(runs):
         alike, odd = draw_shapes(np.random.default_rng([run, n, 8]), X, n)
-        a = both_sides(X + alike - odd, X + alike + odd, T, area).a
+        a = matching_sides(X + alike - odd, X + alike + odd, T, area).a
         said[run] = antisymmetric((a * np.sqrt(area)[:, None]).reshape(n, -1), run)
     return said.mean()
 
@@ -205,7 +205,11 @@ def write(text: str) -> None:
 def shares(name: str, result) -> None:
     """A row of the shares of variance."""
     share = ", ".join(f"{one:.3f}" for one in result["variance_share"].values)
-    gap = f"{100 * result.attrs['gap']:.2f} %" if "gap" in result.attrs else "-"
+    gap = (
+        f"{100 * result.attrs['involution_error']:.2f} %"
+        if "involution_error" in result.attrs
+        else "-"
+    )
     p, least = result["p_value"].item(), result.attrs["smallest_p"]
     write(f"| {name} | {result.sizes['individual']} | {share} | {p:.3f} ({least:.3f}) | {gap} |")
 

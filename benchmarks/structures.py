@@ -22,7 +22,7 @@ import s4a_morphometrics
 from s4a.analysis.permutation import Model
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import vertex_areas
-from s4a_morphometrics.poses import Poses, align_wholes, measured, pose_fields, poses_of
+from s4a_morphometrics.poses import Poses, align_wholes, measure_levels, pose_fields, poses_of
 from s4a_morphometrics.synthetic import bean, subjects
 from s4a_morphometrics.two_block import coordinates, two_block
 
@@ -77,7 +77,7 @@ def shares(runs: int) -> None:
         found = []
         for run in range(runs):
             Y = draw(np.random.default_rng([run, pose, shape]), 12, pose, shape)
-            one = measured(parts_of(Y, [AREA, AREA]), [AREA, AREA], n_permutations=1)
+            one = measure_levels(parts_of(Y, [AREA, AREA]), [AREA, AREA], n_permutations=1)
             found.append(one["level_variance"].sum("structure").values)
         between, within = np.mean(found, axis=0)
         share = [100 * one[0] / one.sum() for one in found]
@@ -133,7 +133,7 @@ def registered() -> None:
             ]
             points.append(of)
         cells = []
-        truth = measured(parts_of(np.swapaxes(points, 0, 1), areas), areas, n_permutations=1)
+        truth = measure_levels(parts_of(np.swapaxes(points, 0, 1), areas), areas, n_permutations=1)
         for measure in ("share", "variance"):
             for one in (found, truth):
                 level = one[f"level_{measure}"].sum("structure").values

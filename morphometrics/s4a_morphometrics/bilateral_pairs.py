@@ -1,7 +1,7 @@
-"""The other side (6.1): partners of the template's vertices, and the template made symmetric.
+"""Bilateral pairs (6.1): partners of the template's vertices, and the symmetrised template.
 
-The mirror image of the template is registered onto it, which gives each vertex v the place tau(v)
-of its partner.
+The mirror image of the template is registered to the template.  This gives the point tau(v) of the
+surface that is the partner of vertex v on the other side.
 """
 
 import logging
@@ -23,7 +23,7 @@ from s4a.study.pair import match_shapes, shape_of
 log = logging.getLogger(__name__)
 
 ITERATIONS = 5  # of the consensus, and of the involution
-# Mean gap of the involution, of sqrt(area), from which the template is reported as asymmetric
+# Error of the involution, as a share of sqrt(area), above which the template may be asymmetric
 FAR = 0.05
 
 
@@ -34,19 +34,19 @@ class Mirror(NamedTuple):
     normal: np.ndarray
 
     def __call__(self, X: np.ndarray) -> np.ndarray:
-        """Points ``(..., 3)`` reflected."""
+        """Reflect points ``(..., 3)``."""
         return X - 2 * ((X - self.center) @ self.normal)[..., None] * self.normal
 
-    def turned(self, vectors: np.ndarray) -> np.ndarray:
-        """Vectors ``(..., 3)`` reflected."""
+    def reflected(self, vectors: np.ndarray) -> np.ndarray:
+        """Reflect vectors ``(..., 3)``."""
         return vectors - 2 * (vectors @ self.normal)[..., None] * self.normal
 
 
 def plane_between(X: np.ndarray, Y: np.ndarray, area: np.ndarray) -> Mirror:
-    """The plane whose reflection brings points Y nearest to X ``(n, 3)``, by area.
+    """Return the plane whose reflection M best maps points Y to X ``(n, 3)``, weighted by area.
 
-    |x - M y|^2 = |x - y|^2 + 4 (n . x)(n . y) about the common centre, so that the normal n is the
-    last eigenvector of the symmetric part of sum w x y^T.
+    |x - M y|^2 = |x - y|^2 + 4 (n . x)(n . y) about the common centre.  The normal n is therefore
+    the eigenvector of the smallest eigenvalue of the symmetric part of sum w x y^T.
 
     Examples
     --------
@@ -63,11 +63,11 @@ def plane_between(X: np.ndarray, Y: np.ndarray, area: np.ndarray) -> Mirror:
 
 
 def symmetry(study: xr.DataTree) -> xr.Dataset:
-    """Where each vertex of the template has its partner on the other side.
+    """Match each vertex of the template to its partner on the other side.
 
-    The mirror image of the template is registered onto it, as a pair on its own
-    (:func:`s4a.match_pair`) with the options of the study.  The map is then made an involution:
-    where tau(tau(v)) misses v by e, half of e, reflected, is added to tau(v), some times.
+    The mirror image of the template is registered to the template, as a single pair
+    (:func:`s4a.match_pair`) with the options of the study.  The map is then made an involution
+    iteratively: half of the reflected error e = v - tau(tau(v)) is added to tau(v).
 
     Parameters
     ----------
@@ -77,11 +77,16 @@ def symmetry(study: xr.DataTree) -> xr.Dataset:
     Returns
     -------
     Dataset
-        ``partner_triangle(vertex)`` and ``partner_barycentric(vertex, corner)``, the place of
-        tau(v); ``partner_distance(vertex)``, the distance of tau(tau(v)) and v that is left, in the
-        unit of the input.  Attributes ``gap``, its root mean square over the area as a share of
-        sqrt(area), ``gap_before`` as the registration gave it, and ``registration_error`` of the
-        registration.
+        ``partner_triangle(vertex)`` and ``partner_barycentric(vertex, corner)``, the point tau(v);
+        ``partner_distance(vertex)``, the remaining distance of tau(tau(v)) and v, in the unit of
+        the input.  Attributes: ``involution_error``, its root mean square over the area as a share
+        of sqrt(area); ``involution_error_before``, the same before the iterations; and
+        ``registration_error`` of the registration.
+
+    See Also
+    --------
+    s4a_morphometrics.asymmetry : asymmetry of every shape.
+    symmetric_template : the template averaged with its mirror image.
 
     Examples
     --------
@@ -90,8 +95,9 @@ def symmetry(study: xr.DataTree) -> xr.Dataset:
     >>> import s4a
     >>> import s4a_morphometrics
     >>> study = s4a.synthetic.example_study()
-    >>> halves = s4a_morphometrics.symmetry(study)
-    >>> halves["partner_triangle"].dims, halves.attrs["gap"] < halves.attrs["gap_before"]
+    >>> partners = s4a_morphometrics.symmetry(study)
+    >>> error, before = (partners.attrs[f"involution_error{when}"] for when in ("", "_before"))
+    >>> partners["partner_triangle"].dims, error < before
     (('vertex',), True)
     """
     registration = registration_of(study)
@@ -107,50 +113,53 @@ def symmetry(study: xr.DataTree) -> xr.Dataset:
     else:
         mesh = as_dataset(X, T)
         template, image = shape_of(mesh, options), shape_of(mirror_image(mesh), options)
-    found = match_shapes(image, template, options)[0]
-    P = image_in_shape(X, found) * MIRROR  # (n, 3), the partner of each vertex
-    place, gap_before, gap = involution(P, X, T)
+    registered = match_shapes(image, template, options)[0]
+    P = image_in_shape(X, registered) * MIRROR  # (n, 3), the partner of each vertex
+    points, before, after = involution(P, X, T)
     area = vertex_areas(X, T)
     size = float(np.sqrt(area.sum()))
     attrs = {
-        "gap": rms(gap, area) / size,
-        "gap_before": rms(gap_before, area) / size,
-        "registration_error": float(found.attrs["score"]),
+        "involution_error": rms(after, area) / size,
+        "involution_error_before": rms(before, area) / size,
+        "registration_error": float(registered.attrs["score"]),
     }
-    if max(attrs["gap"], attrs["registration_error"]) > FAR:
+    if max(attrs["involution_error"], attrs["registration_error"]) > FAR:
         log.warning(
-            "the template and its mirror image differ (registration error %.3f, involution "
-            "to %.3f of sqrt(area)): is it symmetric? Of left and right shapes give subject and "
-            "side",
+            "the template and its mirror image differ (registration error %.3f, involution error "
+            "%.3f of sqrt(area)): is the template symmetric? For left and right shapes, give "
+            "subject and side",
             attrs["registration_error"],
-            attrs["gap"],
+            attrs["involution_error"],
         )
-    result = dataset(attrs, partner_triangle=place[0], partner_barycentric=place[1])
-    result = result.merge(dataset(partner_distance=gap))
+    result = dataset(attrs, partner_triangle=points[0], partner_barycentric=points[1])
+    result = result.merge(dataset(partner_distance=after))
     return in_unit(result, unit_of(registration["position"]))
 
 
-def symmetric_template(study: xr.DataTree, halves: xr.Dataset | None = None) -> xr.Dataset:
-    """The template averaged with its mirror image, each vertex with its partner.
+def symmetric_template(study: xr.DataTree, partners: xr.Dataset | None = None) -> xr.Dataset:
+    """Average the template with its mirror image, each vertex with its partner.
 
-    With M the reflection that fits best, its vertices are (x(v) + M x(tau(v))) / 2, on the same
-    triangles, so that it takes the place of the template's mesh; :func:`s4a.write_mesh` writes it.
-    The mean of all shapes and their mirror images is ``symmetric_position`` of
+    With M the best reflection, the vertices are (x(v) + M x(tau(v))) / 2, on the triangles of the
+    template.  The mean of all shapes and their mirror images is ``symmetric_position`` of
     :func:`s4a_morphometrics.asymmetry`.
 
     Parameters
     ----------
     study : DataTree
         With ``/registration``.
-    halves : Dataset, optional
-        Of :func:`symmetry`, where it is there already.
+    partners : Dataset, optional
+        From :func:`symmetry`; computed by default.
 
     Returns
     -------
     Dataset
-        ``position(vertex, xyz)`` in the unit of the input, ``corner_vertex(triangle, corner)``, and
-        the attributes ``moved``, root mean square distance from the template as a share of
-        sqrt(area), and ``gap`` of :func:`symmetry`, what it is still from being symmetric.
+        ``position(vertex, xyz)`` in the unit of the input, ``corner_vertex(triangle, corner)``.
+        Attributes: ``moved``, root mean square distance from the template as a share of sqrt(area);
+        ``involution_error`` of :func:`symmetry`, which is the remaining asymmetry.
+
+    See Also
+    --------
+    s4a.write_mesh : writes the mesh to a file.
 
     Examples
     --------
@@ -164,52 +173,52 @@ def symmetric_template(study: xr.DataTree, halves: xr.Dataset | None = None) -> 
     (('vertex', 'xyz'), True)
     """
     registration = registration_of(study)
-    halves = symmetry(study) if halves is None else halves
-    require(halves, "partner_triangle", "partner_barycentric", what="symmetry")
+    partners = symmetry(study) if partners is None else partners
+    require(partners, "partner_triangle", "partner_barycentric", what="symmetry")
     X, T = as_arrays(registration)
     area = vertex_areas(X, T)
-    place = halves["partner_triangle"].values, halves["partner_barycentric"].values
-    there = interpolate(X, T, *place)
-    S = (X + plane_between(X, there, area)(there)) / 2
+    points = partners["partner_triangle"].values, partners["partner_barycentric"].values
+    X_partner = interpolate(X, T, *points)
+    S = (X + plane_between(X, X_partner, area)(X_partner)) / 2
     moved = rms(np.linalg.norm(S - X, axis=1), area) / float(np.sqrt(area.sum()))
-    attrs = {"moved": moved, "gap": halves.attrs.get("gap", np.nan)}
+    error = partners.attrs.get("involution_error", np.nan)
+    attrs = {"moved": moved, "involution_error": error}
     return in_unit(as_dataset(S, T, attrs), unit_of(registration["position"]))
 
 
 def rms(values: np.ndarray, area: np.ndarray) -> float:
-    """Root mean square over the area of numbers ``(n,)``."""
+    """Return the area-weighted root mean square of values ``(n,)``."""
     return float(np.sqrt(area @ values**2 / area.sum()))
 
 
 def involution(
     P: np.ndarray, X: np.ndarray, T: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
-    """Partners of vertices, near points P ``(n, 3)``, so that the partner's partner is the vertex.
+    """Make a map of vertices to points P ``(n, 3)`` on the other side an involution tau.
 
     Returns
     -------
-    place : tuple
+    points : tuple
         Triangle ``(n,)`` and barycentric weights ``(n, 3)`` of tau(v) on the surface.
     before, after : float ndarray (n,)
-        Distance of tau(tau(v)) and v, of the nearest points to P, and in the end.
+        Distance of tau(tau(v)) and v, for the points nearest to P, and finally.
     """
     area = vertex_areas(X, T)
     N = vertex_normals(X, T)
 
-    def on_surface(points):
-        plane = plane_between(X, points, area)
-        place = closest_facing_point(points, plane.turned(N), X, T)
-        return place, plane
+    def on_surface(positions):
+        plane = plane_between(X, positions, area)
+        return closest_facing_point(positions, plane.reflected(N), X, T), plane
 
-    place, plane = on_surface(P)
-    misses = []
-    best = place
+    points, plane = on_surface(P)
+    distances = []
+    best = points
     for _ in range(ITERATIONS):
-        there = interpolate(X, T, *place)
-        miss = X - interpolate(there, T, *place)  # e = v - tau(tau(v))
-        misses.append(np.linalg.norm(miss, axis=1))
-        if rms(misses[-1], area) <= min(rms(one, area) for one in misses):
-            best = place
-        place, plane = on_surface(there + plane.turned(miss) / 2)
-    least = min(misses, key=lambda one: rms(one, area))
-    return best, misses[0], least
+        X_partner = interpolate(X, T, *points)
+        e = X - interpolate(X_partner, T, *points)  # v - tau(tau(v))
+        distances.append(np.linalg.norm(e, axis=1))
+        if rms(distances[-1], area) <= min(rms(distance, area) for distance in distances):
+            best = points
+        points, plane = on_surface(X_partner + plane.reflected(e) / 2)
+    smallest = min(distances, key=lambda distance: rms(distance, area))
+    return best, distances[0], smallest

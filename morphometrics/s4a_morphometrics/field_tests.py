@@ -1,4 +1,4 @@
-"""Tests of groups and variables (6.1) on a field of the shapes in place of their displacements."""
+"""Tests of groups and variables (6.1) on a scalar field of the shapes, instead of displacements."""
 
 from typing import TYPE_CHECKING
 
@@ -27,7 +27,7 @@ def field_group_test(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """Test whether groups differ in a field: :func:`s4a.statistics.group_test` of it.
+    """Test groups for a difference in the mean of a field.
 
     Parameters
     ----------
@@ -40,12 +40,17 @@ def field_group_test(
     Returns
     -------
     Dataset
-        As of :func:`s4a.statistics.group_test`.
+        As returned by :func:`s4a.statistics.group_test`.
 
     Raises
     ------
     ValueError
-        When the study has no such field, it does not differ, or a group has fewer than 3 shapes.
+        If the study has no such field, the field does not vary, or a group has fewer than 3 shapes.
+
+    See Also
+    --------
+    s4a.statistics.group_test : the test of displacements.
+    field_group_map : the test at every vertex.
 
     Examples
     --------
@@ -63,8 +68,8 @@ def field_group_test(
     'a: 3, b: 3'
     """
     options = check_options(n_permutations, variances, seed_of(seed, rng))
-    of_field = field_sample(study, field, group, "group", covariates)
-    return compare_groups(of_field.sample, options, n_components)
+    on_field = field_sample(study, field, group, "group", covariates)
+    return compare_groups(on_field.sample, options, n_components)
 
 
 def field_group_map(
@@ -78,7 +83,7 @@ def field_group_map(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """Test at every vertex whether groups differ in a field.
+    """Test groups for a difference in the mean of a field at every vertex.
 
     Parameters
     ----------
@@ -88,14 +93,18 @@ def field_group_map(
     Returns
     -------
     Dataset
-        As of :func:`s4a.statistics.group_map`, with ``field_effect(vertex)`` and
-        ``field_intercept`` in place of ``effect`` and ``intercept``; NaN where not all shapes have
-        the field.
+        As returned by :func:`s4a.statistics.group_map`, with ``field_effect(vertex)`` and
+        ``field_intercept`` in place of ``effect`` and ``intercept``; NaN at vertices where a shape
+        lacks the field.
 
     Raises
     ------
     ValueError
         See :func:`field_group_test`.
+
+    See Also
+    --------
+    s4a.statistics.group_map : the test of displacements.
 
     Examples
     --------
@@ -108,13 +117,13 @@ def field_group_map(
     >>> height = {name: mesh["position"].values[:, 2] for name, mesh in meshes}
     >>> study = s4a_morphometrics.with_field(study, "height", height)
     >>> group = ["a", "a", "a", "b", "b", "b"]
-    >>> where = s4a_morphometrics.field_group_map(study, "height", group, n_permutations=99)
-    >>> where["field_effect"].dims
+    >>> result = s4a_morphometrics.field_group_map(study, "height", group, n_permutations=99)
+    >>> result["field_effect"].dims
     ('vertex',)
     """
     options = check_options(n_permutations, variances, seed_of(seed, rng))
-    of_field = field_sample(study, field, group, "group", covariates)
-    return of_field.on_template(map_groups(of_field.sample, options))
+    on_field = field_sample(study, field, group, "group", covariates)
+    return on_field.on_template(map_groups(on_field.sample, options))
 
 
 def field_regression(
@@ -142,14 +151,19 @@ def field_regression(
     Returns
     -------
     Dataset
-        As of :func:`s4a.statistics.regression`, with ``field_effect(vertex)`` and
+        As returned by :func:`s4a.statistics.regression`, with ``field_effect(vertex)`` and
         ``field_intercept`` in place of ``effect`` and ``intercept``.
 
     Raises
     ------
     ValueError
-        When the study has no such field, it does not differ, or the variable is text, constant or
-        a combination of the covariates.
+        If the study has no such field, the field does not vary, or the variable is text, constant
+        or a combination of the covariates.
+
+    See Also
+    --------
+    s4a.statistics.regression : the regression of displacements.
+    s4a_morphometrics.growth : several visits of each subject.
 
     Examples
     --------
@@ -166,8 +180,8 @@ def field_regression(
     ('vertex',)
     """
     options = check_options(n_permutations, variances, seed_of(seed, rng))
-    of_field = field_sample(study, field, variable, "variable", covariates)
-    return of_field.on_template(regress(of_field.sample, options, n_components))
+    on_field = field_sample(study, field, variable, "variable", covariates)
+    return on_field.on_template(regress(on_field.sample, options, n_components))
 
 
 def field_classify(
@@ -182,7 +196,7 @@ def field_classify(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """Classify shapes by a field: :func:`s4a.statistics.classify` of it.
+    """Classify shapes by a field.
 
     Parameters
     ----------
@@ -195,12 +209,16 @@ def field_classify(
     Returns
     -------
     Dataset
-        As of :func:`s4a.statistics.classify`.
+        As returned by :func:`s4a.statistics.classify`.
 
     Raises
     ------
     ValueError
-        When the study has no such field, it does not differ, or a group has fewer than 3 shapes.
+        If the study has no such field, the field does not vary, or a group has fewer than 3 shapes.
+
+    See Also
+    --------
+    s4a.statistics.classify : classification by displacements.
 
     Examples
     --------
@@ -213,12 +231,12 @@ def field_classify(
     >>> height = {name: mesh["position"].values[:, 2] for name, mesh in meshes}
     >>> study = s4a_morphometrics.with_field(study, "height", height)
     >>> group = ["a", "a", "a", "b", "b", "b"]
-    >>> found = s4a_morphometrics.field_classify(study, "height", group, n_permutations=9)
-    >>> found.attrs["chance"]
+    >>> result = s4a_morphometrics.field_classify(study, "height", group, n_permutations=9)
+    >>> result.attrs["chance"]
     0.5
     """
     check_permutations(n_permutations)
-    of_field = field_sample(study, field, group, "group")
+    on_field = field_sample(study, field, group, "group")
     return classify_sample(
-        of_field.sample, estimator, n_components, n_folds, n_permutations, seed_of(seed, rng)
+        on_field.sample, estimator, n_components, n_folds, n_permutations, seed_of(seed, rng)
     )

@@ -1,7 +1,7 @@
 """Scalar fields of the shapes (6.1, 6.2), such as thickness, transferred to the template.
 
 Every vertex of the template takes the value at the point of the shape that it was registered to,
-linear inside triangles (:mod:`s4a.analysis.transfer`), so that the fields of all shapes can be
+linear inside triangles (:mod:`s4a.analysis.transfer`).  The fields of all shapes can then be
 compared vertex by vertex: :mod:`s4a_morphometrics.field_tests`.
 """
 
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 # One array for each shape, by name or in the order of the study; or a folder of files.
 Fields = dict[str, Any] | Sequence[Any] | np.ndarray | Path | str
 
-# what a test calls the effect on displacements, and what on a field
+# variables of a test of displacements -> variables of a test of a field
 NAMES = {
     "effect": "field_effect",
     "effect_error": "field_error",
@@ -53,27 +53,33 @@ def with_field(
     study : DataTree
         Registered, with ``/original``.
     name : str
-        Of the field, such as ``thickness``: letters, digits, _ and -.
+        Name of the field, such as ``thickness``: letters, digits, _ and -.
     values : dict of str to array_like (vertex,), sequence of these, or path
-        A number for each vertex of the file of a shape, or of its mesh in ``/original``; NaN where
-        there is none.  By shape, or in the order of the study.  Or a folder of files named as the
+        A number for each vertex of the file of a shape, or of its mesh in ``/original``; NaN if
+        missing.  By shape, or in the order of the study.  Or a folder of files named after the
         shapes (:func:`s4a.input.annotations.read_scalars`).
     unit : str, optional
-        Of the numbers, such as ``mm``.
+        Unit of the numbers, such as ``mm``.
     partial : bool
-        Whether shapes may lack the field; tests of it leave them out.
+        Allow shapes without the field; tests of the field leave these shapes out.
 
     Returns
     -------
     DataTree
         With ``/fields/<name>``: ``transferred_field(shape, vertex)`` on the vertices of the
-        template, NaN where over half of the weight is on NaN, and for shapes without the field.
+        template; NaN if over half of the weight is on NaN, and for shapes without the field.
 
     Raises
     ------
     ValueError
-        When a shape lacks the field, has another number of vertices, or numbers that are infinite
-        or all missing; shapes are named.
+        If a shape lacks the field, has another number of vertices, or values that are infinite or
+        all missing; the message names the shapes.
+
+    See Also
+    --------
+    write_field : writes the field to the folder of the study.
+    s4a_morphometrics.field_group_test, s4a_morphometrics.field_regression : test it.
+    s4a_morphometrics.covariation : covariation of the field with shape.
 
     Examples
     --------
@@ -95,40 +101,42 @@ def with_field(
     registration = all_registered(study)
     shapes = registration["shape"].values.tolist()
     given = _by_shape(values, shapes, name, study)
-    missing = [one for one in shapes if given.get(one) is None]
-    needed = [one for one in missing if one not in left_out(study)]
+    missing = [shape for shape in shapes if given.get(shape) is None]
+    needed = [shape for shape in missing if shape not in left_out(study)]
     if needed and not partial:
         raise ValueError(
             f"the field {name!r} needs values for every shape; it lacks {listed(needed, most=9)}: "
             "give them, or partial=True (--partial) to leave these shapes out of its tests"
         )
     if missing:
-        log.warning("no field %r, and left out of its tests: %s", name, listed(missing, most=9))
+        log.warning(
+            "left out of tests of the field %r: no values for %s", name, listed(missing, most=9)
+        )
     if len(missing) == len(shapes):
         raise ValueError(f"no shape of the study has a field {name!r}; it has {listed(shapes)}")
-    carried = np.full((len(shapes), registration.sizes["vertex"]), np.nan)
-    for i, one in enumerate(shapes):
-        if one not in missing:
-            mesh = study["original"][one].to_dataset()
-            field = of_vertices(given[one], mesh, f"the field {name!r} of {one}")
-            carried[i] = on_template(study, one, field)
+    fields = np.full((len(shapes), registration.sizes["vertex"]), np.nan)
+    for i, shape in enumerate(shapes):
+        if shape not in missing:
+            mesh = study["original"][shape].to_dataset()
+            field = of_vertices(given[shape], mesh, f"the field {name!r} of {shape}")
+            fields[i] = on_template(study, shape, field)
     template = registration.attrs.get("template", "")
-    of_all = dataset({"template": template}, transferred_field=carried).assign_coords(shape=shapes)
-    of_all = in_unit(of_all, unit, of=FIELD_UNIT)
+    result = dataset({"template": template}, transferred_field=fields).assign_coords(shape=shapes)
+    result = in_unit(result, unit, of=FIELD_UNIT)
     nodes = {node.path: node.to_dataset(inherit=False) for node in study.subtree}
-    return xr.DataTree.from_dict(nodes | {f"/fields/{name}": of_all}, name=study.name)
+    return xr.DataTree.from_dict(nodes | {f"/fields/{name}": result}, name=study.name)
 
 
 def _by_shape(values, shapes, name, study):
-    """The field of each shape that has one, by name."""
+    """Return the field of each shape that has one, by name."""
     if isinstance(values, str | Path):
         files = files_named(values, shapes, f"the field {name!r}", SUFFIXES, name)
-        return {one: read_scalars(file, name) for one, file in files.items()}
+        return {shape: read_scalars(file, name) for shape, file in files.items()}
     if isinstance(values, dict):
         unknown = sorted(set(map(str, values)) - set(shapes))
         if unknown:
             raise ValueError(
-                f"the field {name!r} has values for {listed(unknown)}, which are no shapes of the "
+                f"the field {name!r} has values for {listed(unknown)}, which are not shapes of the "
                 f"study; it has {listed(shapes)}"
             )
         return values
@@ -143,15 +151,16 @@ def _by_shape(values, shapes, name, study):
 def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
     """Write a field of :func:`with_field` to the folder of its study.
 
-    :func:`s4a.open_study` has it in ``/fields`` as long as the registrations are those that it was
-    carried along.
+    :func:`s4a.open_study` reads it into ``/fields`` as long as the registrations are unchanged.
 
     Parameters
     ----------
     study : DataTree
+        With the field.
     name : str
+        Name of the field.
     folder : path
-        Of the study.
+        Folder of the study.
 
     Returns
     -------
@@ -161,7 +170,11 @@ def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
     Raises
     ------
     ValueError
-        When the study has no such field, or another run is working on the folder.
+        If the study has no such field, or another run is working on the folder.
+
+    See Also
+    --------
+    with_field : adds a field to a study.
 
     Examples
     --------
@@ -182,7 +195,7 @@ def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
         raise ValueError(f"the study has no field {name!r}; with_field adds one")
     field = study["fields"][name].to_dataset()
     registered = study["registration"].children
-    keys = [registered[one].attrs.get("task_key", "") for one in field["shape"].values.tolist()]
+    keys = [registered[shape].attrs.get("task_key", "") for shape in field["shape"].values.tolist()]
     path = Path(folder) / "fields" / f"{name}.nc"
     with lock(folder) as claim:
         write(field, path, task_key(field["transferred_field"].values, *keys), keys, claim)
@@ -190,10 +203,10 @@ def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
 
 
 class FieldSample(NamedTuple):
-    """The shapes of a test that have a field.
+    """The data of a test of a field, for the shapes that have it.
 
     ``sample`` has the field as ``d (s, m, 1)`` and ``area (m,)``, at the vertices ``keep (n,)`` of
-    the template where all shapes have it; ``shape (s, n, 3)`` are their displacements, and
+    the template where all shapes have it; ``shape (s, n, 3)`` has the displacements, and
     ``shape_area (n,)`` the areas of all vertices.
     """
 
@@ -203,39 +216,39 @@ class FieldSample(NamedTuple):
     shape_area: np.ndarray
 
     def whole(self, values: np.ndarray) -> np.ndarray:
-        """Values ``(..., m)`` at all vertices ``(..., n)``, NaN where not all shapes have some."""
+        """Expand values ``(..., m)`` to all vertices ``(..., n)``, with NaN at untested ones."""
         if self.keep.all():
             return values
-        found = np.full((*values.shape[:-1], len(self.keep)), np.nan)
-        found[..., self.keep] = values
-        return found
+        expanded = np.full((*values.shape[:-1], len(self.keep)), np.nan)
+        expanded[..., self.keep] = values
+        return expanded
 
     def on_template(self, result: xr.Dataset) -> xr.Dataset:
-        """A result at all vertices of the template, its effects as those of a field."""
-        found = {}
+        """Return a result at all vertices of the template, with the names of a test of a field."""
+        variables = {}
         for name, values in result.items():
             data = values.values
             if values.dims == ("vertex", "xyz"):
                 data = data[:, 0]
             if "vertex" in values.dims:
                 data = self.whole(data)
-            found[NAMES.get(str(name), str(name))] = data
-        of_field = dataset(result.attrs, **found).assign_coords(result.coords)
-        return in_unit(of_field, self.sample.unit, of=FIELD_UNIT)
+            variables[NAMES.get(str(name), str(name))] = data
+        renamed = dataset(result.attrs, **variables).assign_coords(result.coords)
+        return in_unit(renamed, self.sample.unit, of=FIELD_UNIT)
 
 
 def field_of(study: xr.DataTree, name: str, shapes: Sequence[str]) -> tuple[np.ndarray, str]:
-    """A field of ``/fields`` of these shapes ``(s, n)``, NaN where one has none, and its unit.
+    """Return a field of these shapes ``(s, n)``, NaN for shapes without it, and its unit.
 
     Raises
     ------
     ValueError
-        When the study has no field of that name; those that it has are named.
+        If the study has no field of that name; the message names its fields.
     """
-    there = list(study["fields"].children) if "fields" in study.children else []
-    if name not in there:
+    available = list(study["fields"].children) if "fields" in study.children else []
+    if name not in available:
         raise ValueError(
-            f"the study has no field {name!r}; it has {listed(there) or 'none'}: "
+            f"the study has no field {name!r}; it has {listed(available) or 'none'}: "
             "s4a_morphometrics.with_field, or s4a fields, adds one"
         )
     values = study["fields"][name].to_dataset()["transferred_field"]
@@ -249,30 +262,30 @@ def field_sample(
     what: str,
     covariates: Values | dict[str, Values] | list[str] | None = None,
 ) -> FieldSample:
-    """Return the shapes of a test that have a field, see :func:`s4a.analysis.inputs.sample_of`."""
+    """Return the data of a test of a field, see :func:`s4a.analysis.inputs.sample_of`."""
     names = registration_of(study)["shape"].values.tolist()
-    of_field, unit = field_of(study, field, names)
-    has = np.where(np.isnan(of_field).all(1), np.nan, 0.0)
-    sample = sample_of(study, values, what, covariates, {f"field {field!r}": has})
-    known = np.isin(names, sample.registration["shape"].values)
-    d, keep = _everywhere(of_field[known], field)
+    fields, unit = field_of(study, field, names)
+    has_field = np.where(np.isnan(fields).all(1), np.nan, 0.0)
+    sample = sample_of(study, values, what, covariates, {f"field {field!r}": has_field})
+    selected = np.isin(names, sample.registration["shape"].values)
+    d, keep = _common(fields[selected], field)
     area = sample.area[keep] / sample.area[keep].sum()
     return FieldSample(sample._replace(d=d, area=area, unit=unit), keep, sample.d, sample.area)
 
 
-def _everywhere(values, field):
-    """A field ``(s, m, 1)`` at the vertices ``(n,)`` where all shapes have it."""
+def _common(values, field):
+    """Return a field ``(s, m, 1)`` at the vertices ``(n,)`` where all shapes have it."""
     keep = np.isfinite(values).all(0)
     if not keep.any():
         raise ValueError(f"the field {field!r} has no vertex of the template in all shapes")
     if not keep.all():
         log.warning(
-            "the field %r lacks in some shape at %d of %d vertices, which are not tested",
+            "the field %r is missing in some shape at %d of %d vertices, which are not tested",
             field,
             (~keep).sum(),
             len(keep),
         )
     values = values[:, keep]
     if np.ptp(values, axis=0).max() <= 1e-12 * abs(values).max():
-        raise ValueError(f"the field {field!r} is the same in all shapes: there is nothing to test")
+        raise ValueError(f"the field {field!r} is the same in all shapes: no variation to test")
     return values[..., None], keep

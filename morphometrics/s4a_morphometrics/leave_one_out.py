@@ -1,4 +1,4 @@
-"""True generalization (6.1): each shape left out, and found again by the study of the others."""
+"""Generalization with new correspondences (6.1): leave-one-out of the registration, too."""
 
 import numpy as np
 import xarray as xr
@@ -21,15 +21,15 @@ from s4a.study.insert import insert
 from s4a.study.processes import workers
 from s4a.study.tree import stack_registration, template_mesh
 
-RECOMPUTED = "recomputed for every left-out shape, as a new one in the study of the others"
+RECOMPUTED = "recomputed for every left-out shape, as an out-of-sample shape of the others"
 
 
 def without(study: xr.DataTree, name: str, *, n_jobs: int | None = None) -> xr.DataTree:
-    """The study of all shapes but `name`, which leaves latent space, registration and modes.
+    """Return the study without shape `name` in latent space, registration and modes.
 
-    Where it is the template, the shape next nearest to the limit shape (eq. 5) takes its place, and
-    all others are registered to that.  The other shapes' latent bases stay: they came out of a
-    network that had the shape.
+    If it is the template, the shape next closest to the limit shape (eq. 5) becomes the template,
+    and all others are registered to it.  The latent bases of the other shapes are unchanged; they
+    come from a network that included the shape.
     """
     registration = registration_of(study)
     names = [n for n in registration["shape"].values.tolist() if n != name]
@@ -41,18 +41,18 @@ def without(study: xr.DataTree, name: str, *, n_jobs: int | None = None) -> xr.D
         return xr.DataTree.from_dict(nodes)
     rotation = {n: registration["rotation"].sel(shape=n).values for n in names}
     return xr.DataTree.from_dict(
-        nodes | _register_anew(nodes, latent, rotation, Options.from_report(study), n_jobs)
+        nodes | _register_again(nodes, latent, rotation, Options.from_report(study), n_jobs)
     )
 
 
 def latent_of(study: xr.DataTree, names: list[str]) -> xr.Dataset:
-    """``/latent`` of some shapes, of those that stand apart from the network too."""
-    apart = study["latent"].children
+    """Return ``/latent`` of some shapes, including those excluded from the network."""
+    excluded = study["latent"].children
     latent = study["latent"].to_dataset()
-    if not apart.keys() & set(names):
+    if not excluded.keys() & set(names):
         return latent.sel(shape=names)
     parts = [
-        apart[name].to_dataset(inherit=False) if name in apart else latent.sel(shape=name)
+        excluded[name].to_dataset(inherit=False) if name in excluded else latent.sel(shape=name)
         for name in names
     ]
 
@@ -68,8 +68,8 @@ def latent_of(study: xr.DataTree, names: list[str]) -> xr.Dataset:
     ).assign_coords(shape=names)
 
 
-def _register_anew(nodes, latent, rotation, options, n_jobs):
-    """Nodes of ``/registration`` onto the shape nearest to the limit shape (eq. 5)."""
+def _register_again(nodes, latent, rotation, options, n_jobs):
+    """Return ``/registration`` of all shapes to the one closest to the limit shape (eq. 5)."""
     names = latent["shape"].values.tolist()
     median = str(latent["distance_to_limit"].idxmin().item())
     shapes = {
@@ -81,7 +81,7 @@ def _register_anew(nodes, latent, rotation, options, n_jobs):
     template = shapes[median]
     Y = {n: latent["latent_basis"].sel(shape=n).values for n in names}
     others = [n for n in names if n != median]
-    # R_i turns shape i to the old template, so that R_median^T R_i turns it to the new one
+    # R_i rotates shape i to the old template, so R_median^T R_i rotates it to the new one
     registered = workers(n_jobs)(
         delayed(_register)(
             shapes[n],
@@ -98,7 +98,7 @@ def _register_anew(nodes, latent, rotation, options, n_jobs):
 
 
 def _register(shape, template, bases, rotation, options):
-    """One registration of a shape of a study to another template, its latent basis as it is."""
+    """Register a shape of a study to another template, with its latent basis."""
     with threadpool_limits(1):
         transform = realign(shape.low.cloud, template.low.cloud, (rotation, np.zeros(3)))
         dense_match = options.dense_match
@@ -108,9 +108,9 @@ def _register(shape, template, bases, rotation, options):
 
 
 def _errors_of(study, name, n_points, seed, n_jobs):
-    """Errors of one left-out shape with 0, 1, ... components of the others ``(n,)``.
+    """Return errors of a left-out shape with 0, 1, ... components of the others ``(n,)``.
 
-    Vertex distances, and distances to its own surface, as it was read.
+    Between vertices, and to the surface of the shape as it was read.
     """
     others = without(study, name, n_jobs=n_jobs)
     mesh = study["original"][name].to_dataset().load()
@@ -119,8 +119,8 @@ def _errors_of(study, name, n_points, seed, n_jobs):
     X, T = as_arrays(registration)
     area = vertex_areas(X, T)
     d = registration["displacement"].values  # (n, v, 3)
-    own = new["displacement"].values  # (1, v, 3)
-    K = gram(np.concatenate([d, own]) - d.mean(0), area)
+    left_out = new["displacement"].values  # (1, v, 3)
+    K = gram(np.concatenate([d, left_out]) - d.mean(0), area)
     n = len(d)
     error, _, steps = describe_by_others(K[:n, :n], K[n, :n], K[n, n])
     if not n_points:
@@ -128,8 +128,8 @@ def _errors_of(study, name, n_points, seed, n_jobs):
     points = draw_points(area / area.sum(), n_points, np.random.default_rng(seed))
     R, t, s = (new[v].values[0] for v in ("rotation", "translation", "scale"))
     surface = s * mesh["position"].values @ R.T + t
-    there = X[points] + d[:, points]  # (n, p, 3)
-    return error, surface_error(there, steps, surface, mesh["corner_vertex"].values)
+    drawn = X[points] + d[:, points]  # (n, p, 3)
+    return error, surface_error(drawn, steps, surface, mesh["corner_vertex"].values)
 
 
 def generalization(
@@ -140,37 +140,45 @@ def generalization(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """Generalization with correspondences found again, each shape new to the study of the others.
+    """Estimate generalization by leave-one-out, with new correspondences of the left-out shape.
 
-    :func:`s4a.analysis.statistics.evaluate` leaves a shape out of the modes alone, which is
-    optimistic: its correspondences were made with it.  Here it is also left out of the
-    registration, and :func:`s4a.insert` finds its correspondences against the frozen others.  What
-    still knows it are the latent bases of the others, which came out of one network.
+    :func:`s4a.statistics.evaluate` leaves a shape out of the modes only.  This is optimistic,
+    because its correspondences come from the whole collection.  Here the shape is also left out of
+    the registration, and :func:`s4a.insert` registers it as an out-of-sample shape.  Only the
+    latent bases of the others still depend on it, because they come from one network.
 
     Parameters
     ----------
     study : DataTree
         Finished, with at least 5 shapes.
     n_points : int
-        Vertices of the reconstructions from which distances to the left-out shape's own surface, as
-        it was read, are measured; 0 leaves these out.
+        Number of vertices for distances between reconstructions and the surface of the left-out
+        shape as it was read; 0 computes no such distances.
     n_jobs : int, optional
         As in joblib; the result does not depend on it.
     seed, rng : see :mod:`s4a.seeds`
-        Of these vertices.
+        For the choice of these vertices.
 
     Returns
     -------
     Dataset
-        ``generalization(component)``, root mean square over the area between vertices, and
+        ``generalization(component)``, root mean square distance between vertices over the area, and
         ``generalization_surface(component)``, mean distance from points to the surface; both with
-        their standard errors over the shapes, in the unit of the input.  Attributes
-        ``generalization_0`` of the mean shape alone, ``correspondence``, ``shapes``.
+        their standard errors over the shapes, in the unit of the input.  Attributes:
+        ``generalization_0``, that of the mean shape alone, ``correspondence``, ``shapes``.
 
     Raises
     ------
     ValueError
-        When the study is not finished, or has fewer than 5 shapes.
+        If the study is not finished, or has fewer than 5 shapes.
+
+    See Also
+    --------
+    s4a.statistics.evaluate : compactness, generalization and specificity of the modes.
+
+    References
+    ----------
+    R. H. Davies, C. J. Twining and C. J. Taylor (2008), Statistical models of shape, Springer.
 
     Examples
     --------
@@ -190,7 +198,7 @@ def generalization(
     names = registration["shape"].values.tolist()
     if len(names) < 5:
         raise ValueError(f"at least 5 shapes needed to leave one out, found {len(names)}")
-    # first the template, alone: to leave it out is the one turn with work to share out
+    # the template first and alone: only leaving it out has registrations to run in parallel
     template = registration.attrs["template"]
     seed = seed_of(seed, rng)
     first = _errors_of(study, template, n_points, seed, n_jobs)

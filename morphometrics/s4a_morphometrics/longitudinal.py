@@ -1,14 +1,13 @@
-"""Growth and repeated measures (6.1): several visits of each subject, change within subjects.
+"""Growth and repeated measures (6.1): change of shape within subjects with several visits.
 
 At every vertex and coordinate y_ij = b_0 + b_1 t_ij + z_ij b + u_i + e_ij: visit j of subject i at
-time t_ij, covariates z, an intercept u_i of the subject, normal of variance s_u^2, and a residual
-of variance s_e^2 (Laird and Ware 1982).  Given the ratio r = s_u^2 / s_e^2 all else has a closed
-form; r itself is where the restricted likelihood is largest, by a search along one line for all
-vertices at once.  Where all subjects were seen at the same times the slope is that within subjects,
-whatever r is.
+time t_ij, covariates z, a random intercept u_i of variance s_u^2, and a residual of variance s_e^2
+(Laird and Ware 1982).  Given the ratio r = s_u^2 / s_e^2, the other parameters have a closed form.
+A line search, for all vertices at once, finds the r that maximises the restricted likelihood.  If
+all subjects were measured at the same times, the slope is that within subjects for any r.
 
-p values are those of visits permuted within their subjects: what differs between subjects, and so
-u_i, is taken from both sides first, and blocks of visits are exchangeable where nothing changes.
+For p values, visits are permuted within subjects.  The means of subjects, and thus u_i, are
+subtracted first; without change, the visits of a subject are exchangeable.
 """
 
 import logging
@@ -35,16 +34,16 @@ from s4a_morphometrics.fields import field_sample
 
 log = logging.getLogger(__name__)
 
-RATIOS = np.r_[0, np.geomspace(1e-3, 1e6, 37)]  # of variances, where the search begins
-STEPS = 60  # of the golden section: 1e-12 of what is between two of them
+RATIOS = np.r_[0, np.geomspace(1e-3, 1e6, 37)]  # grid of variance ratios for the search
+STEPS = 60  # golden-section steps: 1e-12 of a grid interval
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 class Mixed(NamedTuple):
-    """A model of random intercepts: of each of v responses.
+    """Fitted random-intercept model of v responses.
 
-    ``slope (p, v)`` of the columns and their standard ``error (p, v)``, ``ratio (v,)`` of the
-    variance of the intercepts to that of the residuals, and the latter, ``variance (v,)``.
+    ``slope (p, v)`` of the columns and its standard ``error (p, v)``; ``ratio (v,)`` of the
+    variance of the intercepts to the residual variance, and the latter, ``variance (v,)``.
     """
 
     slope: np.ndarray
@@ -56,10 +55,10 @@ class Mixed(NamedTuple):
 def random_intercepts(
     Y: np.ndarray, X: np.ndarray, subject: np.ndarray, *, restricted: bool = True
 ) -> Mixed:
-    """Fit y = X b + u_subject + e to many responses at once, by the restricted likelihood.
+    """Fit y = X b + u_subject + e to many responses at once, by restricted likelihood.
 
-    With m_i visits of subject i, V_i^-1 = I - r / (1 + m_i r) 1 1^T, so that X^T V^-1 X and its
-    like are sums over the few different m_i, and b and the variance follow from r.
+    With m_i visits of subject i, V_i^-1 = I - r / (1 + m_i r) 1 1^T.  X^T V^-1 X and similar
+    products are therefore sums over the few different m_i; b and the variance follow from r.
 
     Parameters
     ----------
@@ -77,7 +76,12 @@ def random_intercepts(
     Raises
     ------
     ValueError
-        When the columns of X depend on each other.
+        If the columns of X are linearly dependent.
+
+    References
+    ----------
+    N. M. Laird and J. H. Ware (1982), Random-effects models for longitudinal data, Biometrics
+    38(4).
 
     Examples
     --------
@@ -93,25 +97,25 @@ def random_intercepts(
     scale = np.linalg.norm(X, axis=0)
     Q, R = np.linalg.qr(X / np.where(scale > 0, scale, 1))
     if abs(np.diag(R)).min() < 1e-9:
-        raise ValueError("columns of the model depend on each other: leave one of them out")
+        raise ValueError("columns of the model are linearly dependent: leave one of them out")
     first = Q.T @ Y
-    Y = Y - Q @ first  # residuals of least squares: what is left has few digits to lose
+    Y = Y - Q @ first  # least-squares residuals, to limit cancellation
     code, sizes = np.unique(subject, return_inverse=True, return_counts=True)[1:]
-    of_subject = np.zeros((len(sizes), n))
-    of_subject[code, np.arange(n)] = 1
-    sums, totals = of_subject @ Q, of_subject @ Y  # (s, p), (s, v)
+    indicator = np.zeros((len(sizes), n))
+    indicator[code, np.arange(n)] = 1
+    sums, totals = indicator @ Q, indicator @ Y  # (s, p), (s, v)
     counts, which = np.unique(sizes, return_inverse=True)  # (m,) different numbers of visits
-    each = [which == i for i in range(len(counts))]
-    S = np.stack([sums[of].T @ sums[of] for of in each])  # (m, p, p)
-    U = np.stack([sums[of].T @ totals[of] for of in each])  # (m, p, v)
-    T = np.stack([(totals[of] ** 2).sum(0) for of in each])  # (m, v)
-    number = np.array([of.sum() for of in each])
+    masks = [which == i for i in range(len(counts))]
+    S = np.stack([sums[mask].T @ sums[mask] for mask in masks])  # (m, p, p)
+    U = np.stack([sums[mask].T @ totals[mask] for mask in masks])  # (m, p, v)
+    T = np.stack([(totals[mask] ** 2).sum(0) for mask in masks])  # (m, v)
+    number = np.array([mask.sum() for mask in masks])
     squared = (Y**2).sum(0)  # (v,)
     floor = 1e-24 * squared.max(initial=0) + np.finfo(float).tiny
     dof = n - p if restricted else n
 
-    def parts(r):
-        """A = Q^T V^-1 Q (v, p, p), Q^T V^-1 y (v, p) and the weighted residual (v,)."""
+    def solve(r):
+        """A = Q^T V^-1 Q (v, p, p), A^-1 Q^T V^-1 y (v, p) and the weighted residual (v,)."""
         c = r[:, None] / (1 + r[:, None] * counts)  # (v, m)
         A = np.eye(p) - np.einsum("vm,mpq->vpq", c, S)
         b = -np.einsum("vm,mpv->vp", c, U)
@@ -121,25 +125,25 @@ def random_intercepts(
 
     def deviance(r):
         """-2 log of the likelihood, up to a constant ``(v,)``."""
-        A, _, rest = parts(r)
-        found = dof * np.log(rest) + np.log1p(r[:, None] * counts) @ number
-        return found + np.linalg.slogdet(A)[1] if restricted else found
+        A, _, rest = solve(r)
+        value = dof * np.log(rest) + np.log1p(r[:, None] * counts) @ number
+        return value + np.linalg.slogdet(A)[1] if restricted else value
 
     v = Y.shape[1]
     grid = np.stack([deviance(np.full(v, r)) for r in RATIOS])  # (g, v)
     best = grid.argmin(0)
     low, high = RATIOS[np.maximum(best - 1, 0)], RATIOS[np.minimum(best + 1, len(RATIOS) - 1)]
     ratio = _golden(deviance, low, high)
-    A, solved, rest = parts(ratio)
+    A, solved, rest = solve(ratio)
     variance = rest / dof
-    back = np.linalg.inv(R) / np.where(scale > 0, scale, 1)[:, None]  # of Q to columns of X
+    back = np.linalg.inv(R) / np.where(scale > 0, scale, 1)[:, None]  # from Q to columns of X
     covariance = np.einsum("pa,vab,qb->vpq", back, np.linalg.inv(A), back, optimize=True)
     error = np.sqrt(np.einsum("vpp->pv", covariance) * variance)
     return Mixed(back @ (first + solved.T), error, ratio, variance)
 
 
 def _golden(function, low, high):
-    """Where a function of many variables, each on its own, is least between two bounds."""
+    """Minimise independent functions of one variable each between two bounds (golden section)."""
     a, b = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
     at_a, at_b = function(a), function(b)
     for _ in range(STEPS):
@@ -150,12 +154,12 @@ def _golden(function, low, high):
         new = function(np.where(left, a_next, b_next))
         at_a, at_b = np.where(left, new, at_b), np.where(left, at_a, new)
         a, b = a_next, b_next
-    found, at_zero = (low + high) / 2, np.zeros_like(low)
-    return np.where(function(at_zero) <= function(found), at_zero, found)
+    middle, zero = (low + high) / 2, np.zeros_like(low)
+    return np.where(function(zero) <= function(middle), zero, middle)
 
 
 def within_subjects(values: np.ndarray, subject: np.ndarray) -> np.ndarray:
-    """Values ``(n, ...)`` less the mean of their subject.
+    """Subtract the mean of each subject from values ``(n, ...)``.
 
     Examples
     --------
@@ -188,7 +192,7 @@ def growth(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """How does shape change with time, where subjects were seen several times?
+    """Estimate and test the change of shape with time, for subjects with several visits.
 
     Parameters
     ----------
@@ -196,47 +200,56 @@ def growth(
     time : array_like (shape,), dict of shape to value, or name in /subjects
         Age, or time since the first visit.
     subject : as `time`, numbers or text
-        Whose each shape is.
+        Subject of each shape.
     covariates, field, n_components, n_permutations, seed, rng
-        See :func:`s4a.statistics.group_test`.  Covariates that are one value for each subject count
-        in the slopes, and change no p value.
+        See :func:`s4a.statistics.group_test`.  Covariates with one value per subject affect the
+        slopes, but no p value.
     of : see :func:`s4a.statistics.group_map`
-        Of the test; slopes are of vectors.
+        Quantity of the test; slopes are vectors.
     variances : {"equal", "unequal"}
-        Visits are permuted within their subjects: a test of no change in anyone.  Or the signs of
-        whole subjects are changed, so that each keeps its own slope and variance: a test of no
-        change on average, to take where subjects change differently.
+        "equal" permutes visits within subjects: the null hypothesis is no change in any subject.
+        "unequal" changes signs of whole subjects: the null hypothesis is no change on average, and
+        subjects may have different slopes and variances.
 
     Returns
     -------
     Dataset
         ``effect(vertex, xyz)`` per unit of time, its standard error ``effect_error``, and
-        ``intercept(vertex, xyz)`` where time is at its mean, by the restricted likelihood of random
-        intercepts for each coordinate; ``within_effect(vertex, xyz)``, the slope within subjects
-        alone; ``subject_variance(vertex)`` of the intercepts and ``residual_variance(vertex)``,
-        sums over the coordinates, and ``intraclass_correlation(vertex)``.
-        The test of change within subjects: of the whole shape ``statistic`` and ``p_value``, at
-        every vertex as of :func:`s4a.statistics.group_map`, ``effect_size`` = Cohen's f.
+        ``intercept(vertex, xyz)`` at the mean time, by restricted likelihood with random intercepts
+        for each coordinate; ``within_effect(vertex, xyz)``, the slope within subjects only;
+        ``subject_variance(vertex)`` of the intercepts and ``residual_variance(vertex)``, sums over
+        the coordinates, and ``intraclass_correlation(vertex)``.
+        Test of change within subjects: ``statistic`` and ``p_value`` of the whole shape, at every
+        vertex as in :func:`s4a.statistics.group_map`, ``effect_size`` = Cohen's f.
         ``standard_score(shape)`` of time; ``shape_time(shape)``, the time at which the mean shape
-        is nearest to each.  Of a field ``field_effect``, ``field_error``, ``field_intercept`` and
-        ``field_within_effect`` in place of the first.  Attributes as of
-        :func:`s4a.statistics.regression`, and how many ``subjects`` and those seen ``once``.
+        is closest to each.  For a field, ``field_effect``, ``field_error``, ``field_intercept`` and
+        ``field_within_effect`` replace the first four.  Attributes as in
+        :func:`s4a.statistics.regression`, and the numbers of ``subjects`` and of those with one
+        visit only, ``once``.
 
     Raises
     ------
     ValueError
-        When fewer than two subjects were seen at different times, time is text, constant or a
+        If fewer than two subjects were measured at different times, time is text, constant or a
         combination of the covariates, or an option is out of range.
+
+    See Also
+    --------
+    s4a.statistics.predict : mean shape at a time.
+    s4a.statistics.regression_modes : the trajectory as a mode of variation.
 
     Notes
     -----
-    :func:`s4a.statistics.predict` gives the mean shape at a time, and
-    :func:`s4a.statistics.regression_modes` the trajectory for everything that shows modes.  A
-    subject that was seen once says something of slopes, and nothing of the test.
+    A subject with one visit contributes to the slopes, but not to the test.
+
+    References
+    ----------
+    N. M. Laird and J. H. Ware (1982), Random-effects models for longitudinal data, Biometrics
+    38(4).
 
     Examples
     --------
-    With the ``study`` of six small brains, as of three subjects:
+    With the ``study`` of six small brains, as visits of three subjects:
 
     >>> import s4a
     >>> import s4a_morphometrics
@@ -247,111 +260,108 @@ def growth(
     (('vertex', 'xyz'), 3, 0.25)
     """
     options = check_options(n_permutations, variances, seed_of(seed, rng))
-    of_field = None
+    on_field = None
     if field is None:
         sample = sample_of(study, time, "time", covariates)
     elif of == "normal":
-        raise ValueError("a field has no part along the normals: leave out of='normal'")
+        raise ValueError("a field has no normal component: leave out of='normal'")
     else:
-        of_field = field_sample(study, field, time, "time", covariates)
-        sample = of_field.sample
+        on_field = field_sample(study, field, time, "time", covariates)
+        sample = on_field.sample
     numbers_of(sample.values, "time")
-    sample, whose = _with_subjects(study, sample, subject)
+    sample, subjects = _with_subjects(study, sample, subject)
     t = sample.values.astype(float)
-    seen = _seen(t, whose)
+    repeated = _repeated(t, subjects)
     columns = [np.ones(len(t)), t - t.mean()]
     if sample.Z is not None:
         columns += list(_independent(sample.Z, t).T)
     X = np.column_stack(columns)
     d = sample.d.astype(float)
-    mixed = random_intercepts(d.reshape(len(d), -1), X, whose)
-    test = _test(sample, t, whose, seen, of, n_components, options)
-    test.update(_estimates(sample, mixed, t, whose, seen))
+    mixed = random_intercepts(d.reshape(len(d), -1), X, subjects)
+    test = _test(sample, t, subjects, repeated, of, n_components, options)
+    test.update(_estimates(sample, mixed, t, subjects, repeated))
     result = dataset(test.pop("attrs"), **test)
-    result = in_unit(result, sample.unit) if of_field is None else of_field.on_template(result)
+    result = in_unit(result, sample.unit) if on_field is None else on_field.on_template(result)
     shapes = sample.registration["shape"].values
     return result.assign_coords(shape=shapes).assign_attrs(
         mean=float(t.mean()),
         lowest=float(t.min()),
         highest=float(t.max()),
         standard_deviation=float(t.std(ddof=1)),
-        freed_deviation=_deviation_within(sample.Z, t, whose),
+        freed_deviation=_deviation_within(sample.Z, t, subjects),
         of=of,
-        subjects=len(np.unique(whose)),
-        once=len(np.unique(whose[~seen])),
+        subjects=len(np.unique(subjects)),
+        once=len(np.unique(subjects[~repeated])),
         **sample.attributes,
     )
 
 
 def _deviation_within(Z, t, subject):
-    """The standard deviation of time within subjects, of what the covariates leave of it there."""
+    """Return the standard deviation of time within subjects, adjusted for the covariates."""
     inside = within_subjects(t[:, None], subject)[:, 0]
     return freed_deviation(inside, None if Z is None else within_subjects(Z, subject))
 
 
 def _with_subjects(study, sample, subject):
-    """The sample of shapes whose subject is known, and a number for the subject of each."""
+    """Return the sample of shapes with a subject, and the subject of each."""
     shapes = sample.registration["shape"].values
-    everyone = values_of(study, subject, "subject")
     names = registration_of(study)["shape"].values.tolist()
-    of = dict(zip(names, (str(one) for one in everyone.tolist()), strict=True))
-    words = np.array([of[shape] for shape in shapes.tolist()])
-    known = (words != "") & (words != "nan")
-    if not known.all():
-        lacking = shapes[~known].tolist()
-        log.warning("no subject, and left out: %s", listed(lacking, most=9))
-        said = {**sample.attributes}
-        said["left_out"] = ", ".join(filter(None, [said["left_out"], *lacking]))
+    values = (str(value) for value in values_of(study, subject, "subject").tolist())
+    subject_of = dict(zip(names, values, strict=True))
+    subjects = np.array([subject_of[shape] for shape in shapes.tolist()])
+    present = (subjects != "") & (subjects != "nan")
+    if not present.all():
+        lacking = shapes[~present].tolist()
+        log.warning("left out, because the subject is missing: %s", listed(lacking, most=9))
+        attributes = {**sample.attributes}
+        attributes["left_out"] = ", ".join(filter(None, [attributes["left_out"], *lacking]))
         sample = sample._replace(
-            registration=sample.registration.isel(shape=known),
-            d=sample.d[known],
-            values=sample.values[known],
-            Z=None if sample.Z is None else sample.Z[known],
-            said=said,
+            registration=sample.registration.isel(shape=present),
+            d=sample.d[present],
+            values=sample.values[present],
+            Z=None if sample.Z is None else sample.Z[present],
+            attributes=attributes,
         )
-    return sample, words[known]
+    return sample, subjects[present]
 
 
-def _seen(t, subject):
-    """Which visits are of subjects that were seen at different times; says who was seen once."""
-    moved = within_subjects(t, subject) != 0
-    several = {one for one in np.unique(subject).tolist() if moved[subject == one].any()}
+def _repeated(t, subject):
+    """Return a mask of visits of subjects with different times; a warning names the others."""
+    differs = within_subjects(t, subject) != 0
     names = np.unique(subject).tolist()
-    once = [one for one in names if one not in several]
+    several = {name for name in names if differs[subject == name].any()}
+    once = [name for name in names if name not in several]
     if len(several) < 2:
         raise ValueError(
-            "growth needs at least two subjects that were seen at different times, found "
-            f"{len(several)} of {len(names)}; for one visit of each, take a regression"
+            "growth needs at least two subjects with visits at different times, found "
+            f"{len(several)} of {len(names)}; for one visit of each, use a regression"
         )
     if once:
         log.warning(
-            "seen at one time only, so that the test of change does not have them: %s",
-            listed(once, most=9),
+            "visits at one time only, left out of the test of change: %s", listed(once, most=9)
         )
     return np.isin(subject, sorted(several))
 
 
 def _independent(Z, t):
-    """The columns of the covariates that are not constant or combinations of those before."""
+    """Return the linearly independent columns of the covariates."""
     columns = standardize(np.column_stack([t, Z]))[0]
-    kept = [0]
+    independent = [0]
     for i in range(1, columns.shape[1]):
-        rest = (
-            columns[:, i]
-            - columns[:, kept] @ np.linalg.lstsq(columns[:, kept], columns[:, i], rcond=None)[0]
-        )
+        basis = columns[:, independent]
+        rest = columns[:, i] - basis @ np.linalg.lstsq(basis, columns[:, i], rcond=None)[0]
         if np.linalg.norm(rest) > 1e-8:
-            kept.append(i)
-    return columns[:, kept[1:]]
+            independent.append(i)
+    return columns[:, independent[1:]]
 
 
-def _test(sample, t, subject, seen, of, n_components, options):
-    """Change within subjects: of the whole shape, and at every vertex."""
-    subject, d = subject[seen], sample.d[seen]
-    x = within_subjects(t[seen], subject)
+def _test(sample, t, subject, repeated, of, n_components, options):
+    """Test change within subjects, of the whole shape and at every vertex."""
+    subject, d = subject[repeated], sample.d[repeated]
+    x = within_subjects(t[repeated], subject)
     Z = None
     if sample.Z is not None:
-        Z = within_subjects(sample.Z[seen], subject)
+        Z = within_subjects(sample.Z[repeated], subject)
         Z = Z if Z.any() else None
     E = within_subjects(d, subject)
     fields = fields_to_test(E, sample.registration, of)
@@ -364,29 +374,30 @@ def _test(sample, t, subject, seen, of, n_components, options):
             f"{fields.shape[2]} coordinates at a vertex: more visits needed, or of='normal'"
         )
     model = Model(x, Z, blocks=subject, **options)
-    found = vertex_results(model.vertex_test(fields))
+    at_vertices = vertex_results(model.vertex_test(fields))
     variance, V = principal_components(gram(E, sample.area))
     if not len(variance):
         raise ValueError("growth needs shapes that differ within subjects; all visits are equal")
     c = count_components(variance, dof, n_components, most=len(variance))
     statistic, p_value = model.test(V[:, :c] * np.sqrt(len(E) - 1))
-    return found | {
+    return at_vertices | {
         "attrs": {"components": c} | model.attributes(),
-        "effect_size": np.sqrt(squared_cohen_f(found["explained_share"])),
-        # as many visits as are not taken by the means of subjects are free
+        "effect_size": np.sqrt(squared_cohen_f(at_vertices["explained_share"])),
+        # the means of subjects take degrees of freedom
         "statistic": statistic * (dof - 1) / (len(x) - 2 - rank),
         "p_value": p_value,
     }
 
 
-def _estimates(sample, mixed, t, subject, seen):
-    """Slopes, their errors, variances, and where on the trajectory each shape is."""
+def _estimates(sample, mixed, t, subject, repeated):
+    """Return slopes, their errors, variances, and the time of each shape on the trajectory."""
     k = sample.d.shape[2]
-    x = within_subjects(t[seen], subject[seen])
-    E = within_subjects(sample.d[seen].astype(float), subject[seen]).reshape(len(x), -1)
+    subject = subject[repeated]
+    x = within_subjects(t[repeated], subject)
+    E = within_subjects(sample.d[repeated].astype(float), subject).reshape(len(x), -1)
     columns = [x]
     if sample.Z is not None:
-        columns += list(within_subjects(sample.Z[seen], subject[seen]).T)
+        columns += list(within_subjects(sample.Z[repeated], subject).T)
     C, scale = np.column_stack(columns), np.linalg.norm(np.column_stack(columns), axis=0)
     scale[scale == 0] = 1
     within = (np.linalg.pinv(C / scale, rcond=1e-10) @ E)[0] / scale[0]

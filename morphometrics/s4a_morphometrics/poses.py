@@ -1,22 +1,22 @@
-"""Several structures of each subject (6.1): how they lie beside each other, and what each is like.
+"""Multi-structure studies (6.1): variation in relative pose and in shape.
 
-All registered surfaces of a subject lie in the frame of its scan.  The subject is moved as a whole
-onto the mean of all (generalised Procrustes, Gower 1975).  Then each structure k of subject i is
+All registered surfaces of a subject are in the frame of its scan.  Each subject is aligned as a
+whole to the mean (generalised Procrustes, Gower 1975).  Then structure k of subject i is
 
     Y_ik = exp(w_ik) (S_k + v_ik - g_k) + g_k + t_ik
 
-with its mean shape S_k of centroid g_k, a pose relative to the whole, turned by the vector w_ik and
-shifted by t_ik (Bossa and Olmos 2006), and the shape v_ik that is left (least squares).  Poses are
-compared as fields in the unit of the surfaces, d_ik = w_ik x (S_k - g_k) + t_ik.  At its best the
-pose leaves a v_ik without shift and turn, sum_p a_p v_ik = 0 and sum_p a_p (S_k - g_k) x v_ik = 0
-under the areas a_p of the vertices, so that the two levels are orthogonal and their variances add
-up without a rest:
+with its mean shape S_k of centroid g_k, a pose relative to the whole, which is a rotation vector
+w_ik and a translation t_ik (Bossa and Olmos 2006), and the residual shape v_ik (least squares).
+Poses are compared as displacement fields in the unit of the surfaces,
+d_ik = w_ik x (S_k - g_k) + t_ik.  The optimal pose leaves a v_ik without translation and rotation,
+sum_p a_p v_ik = 0 and sum_p a_p (S_k - g_k) x v_ik = 0 under the areas a_p of the vertices.  The
+two levels are therefore orthogonal and their variances add up exactly:
 
     sum |d + v|^2 = sum |d|^2 (between structures) + sum |v|^2 (within structures).
 
-The two levels are those of multi-level component analysis (Timmerman 2006; of shapes in ShapeWorks,
-Iyer et al. 2022, which takes only the positions of the centres as poses; of organs at several
-resolutions Cerrolaza et al. 2015).  A structure weighs by its area.
+These are the two levels of multi-level component analysis (Timmerman 2006; for shapes in
+ShapeWorks, Iyer et al. 2022, whose poses are the positions of the centres only; for organs at
+several resolutions Cerrolaza et al. 2015).  A structure is weighted by its area.
 """
 
 import logging
@@ -42,17 +42,17 @@ from s4a_morphometrics.two_block import coordinates, two_block
 log = logging.getLogger(__name__)
 
 LEVELS = ("joint", "between", "within")
-MOST_STEPS, CLOSE = 200, 1e-12  # of the means; until they move by so little of the size
-FAR, LEAST = 6, 0.1  # a pose is reported of from so many times the usual, and this much of the size
-SAME_CENTRE = 1e-3  # of the size: as if every file was centred
-MOST_RATIO = 300  # of sizes: as if units differed
+MOST_STEPS, CLOSE = 200, 1e-12  # iterations of the mean; tolerance, relative to the size
+FAR, LEAST = 6, 0.1  # a pose is reported above FAR times the median, and LEAST times the size
+SAME_CENTRE = 1e-3  # relative to the size: files may have been centred
+MOST_RATIO = 300  # of sizes: units may differ
 
 
 class Poses(NamedTuple):
-    """One structure of s subjects: its mean, how it lies, and what its shape is.
+    """Mean shape, poses and shapes of one structure of s subjects.
 
-    ``mean (n, 3)``, ``rotation (s, 3)`` as vectors around the centroid of the mean and
-    ``translation (s, 3)``, their mean zero, and ``shape (s, n, 3)``, displacements of the mean.
+    ``mean (n, 3)``; ``rotation (s, 3)``, rotation vectors about the centroid of the mean, and
+    ``translation (s, 3)``, both of mean zero; ``shape (s, n, 3)``, displacements of the mean.
     """
 
     mean: np.ndarray
@@ -61,8 +61,8 @@ class Poses(NamedTuple):
     shape: np.ndarray
 
 
-def align_wholes(Y: np.ndarray, area: np.ndarray, *, scale: bool = False) -> np.ndarray:
-    """Subjects moved rigidly onto their mean, all their points as one (generalised Procrustes).
+def align_wholes(Y: np.ndarray, area: np.ndarray, *, remove_size: bool = False) -> np.ndarray:
+    """Align whole subjects rigidly to their mean (generalised Procrustes).
 
     Parameters
     ----------
@@ -70,27 +70,31 @@ def align_wholes(Y: np.ndarray, area: np.ndarray, *, scale: bool = False) -> np.
         Corresponding points of the subjects.
     area : float ndarray (n,)
         Their weights.
-    scale : bool
-        Whether all are first brought to the mean of their sizes (centroid sizes).
+    remove_size : bool
+        Scale all subjects to the mean centroid size first.
 
     Returns
     -------
     float ndarray (s, n, 3)
+
+    References
+    ----------
+    J. C. Gower (1975), Generalized Procrustes analysis, Psychometrika 40(1).
 
     Examples
     --------
     >>> import numpy as np
     >>> from s4a_morphometrics.poses import align_wholes
     >>> Y = np.eye(4)[:, 1:] * [1, 2, 3]
-    >>> turned = Y[:, [1, 2, 0]] + 5  # by 120 degrees
-    >>> one, other = align_wholes(np.stack([Y, turned]), np.ones(4))
-    >>> np.allclose(one, other)
+    >>> rotated = Y[:, [1, 2, 0]] + 5  # by 120 degrees
+    >>> first, second = align_wholes(np.stack([Y, rotated]), np.ones(4))
+    >>> np.allclose(first, second)
     True
     """
     w = area / area.sum()
     Y = Y - np.einsum("n,snx->sx", w, Y)[:, None]
     size = np.sqrt(np.einsum("n,snx->s", w, Y**2))
-    if scale:
+    if remove_size:
         Y = Y * (size.mean() / size)[:, None, None]
     mean = Y[0]
     for _ in range(MOST_STEPS):
@@ -104,12 +108,12 @@ def align_wholes(Y: np.ndarray, area: np.ndarray, *, scale: bool = False) -> np.
 
 
 def poses_of(Y: np.ndarray, area: np.ndarray) -> Poses:
-    """The pose of a structure in every subject, and its shape without.
+    """Separate the pose of a structure from its shape in every subject.
 
     Parameters
     ----------
     Y : float ndarray (s, n, 3)
-        The structure in subjects that are aligned as a whole.
+        The structure in the aligned subjects.
     area : float ndarray (n,)
 
     Examples
@@ -117,8 +121,8 @@ def poses_of(Y: np.ndarray, area: np.ndarray) -> Poses:
     >>> import numpy as np
     >>> from s4a_morphometrics.poses import poses_of
     >>> Y = np.eye(4)[:, 1:] * [1.0, 2, 3]
-    >>> found = poses_of(np.stack([Y + [1, 0, 0], Y - [1, 0, 0]]), np.ones(4))
-    >>> found.translation.round(6)[:, 0].tolist(), bool(abs(found.shape).max() < 1e-9)
+    >>> result = poses_of(np.stack([Y + [1, 0, 0], Y - [1, 0, 0]]), np.ones(4))
+    >>> result.translation.round(6)[:, 0].tolist(), bool(abs(result.shape).max() < 1e-9)
     ([1.0, -1.0], True)
     """
     w = area / area.sum()
@@ -126,16 +130,16 @@ def poses_of(Y: np.ndarray, area: np.ndarray) -> Poses:
     size = np.sqrt(w @ ((mean - w @ mean) ** 2).sum(1))
     for _ in range(MOST_STEPS):
         g = w @ mean
-        _, turn, t, shape = poses_on(mean, Y, w)
-        step = shape.mean(0), turn.mean(0), t.mean(0)
+        _, rotation, t, shape = poses_on(mean, Y, w)
+        step = shape.mean(0), rotation.mean(0), t.mean(0)
         if max(abs(step[0]).max(), abs(step[1]).max() * size, abs(step[2]).max()) < CLOSE * size:
             break
         mean = (mean + step[0] - g) @ Rotation.from_rotvec(step[1]).as_matrix().T + g + step[2]
-    return Poses(mean, turn, t, shape)
+    return Poses(mean, rotation, t, shape)
 
 
 def poses_on(mean: np.ndarray, Y: np.ndarray, area: np.ndarray) -> Poses:
-    """The poses of a structure beside a mean shape that is known, and its shapes without.
+    """Separate poses from shapes of a structure, relative to a given mean shape.
 
     Parameters
     ----------
@@ -151,39 +155,39 @@ def poses_on(mean: np.ndarray, Y: np.ndarray, area: np.ndarray) -> Poses:
     return Poses(mean, Rotation.from_matrix(R).as_rotvec(), t, shape)
 
 
-def wholes_of(found: xr.Dataset) -> np.ndarray:
-    """The aligned subjects ``(s, n, 3)``, all structures of each as one: Y_ik above."""
-    Y = np.empty(found["within_displacement"].shape)
-    for k, here in places_of(found):
-        one = poses_in(found, k, here)
-        area = found["vertex_area"].values[here]
-        g = area @ one.mean / area.sum()
-        turn = Rotation.from_rotvec(one.rotation).as_matrix()
-        turned = np.einsum("sxy,sny->snx", turn, one.mean - g + one.shape)
-        Y[:, here] = turned + (g + one.translation)[:, None]
+def wholes_of(result: xr.Dataset) -> np.ndarray:
+    """Return the aligned subjects ``(s, n, 3)``, all structures together: Y_ik above."""
+    Y = np.empty(result["within_displacement"].shape)
+    for k, vertices in enumerate(vertices_of(result)):
+        poses = poses_in(result, k, vertices)
+        area = result["vertex_area"].values[vertices]
+        g = area @ poses.mean / area.sum()
+        R = Rotation.from_rotvec(poses.rotation).as_matrix()
+        rotated = np.einsum("sxy,sny->snx", R, poses.mean - g + poses.shape)
+        Y[:, vertices] = rotated + (g + poses.translation)[:, None]
     return Y
 
 
-def poses_in(found: xr.Dataset, k: int, here: np.ndarray) -> Poses:
-    """Those of structure k, with vertices `here`, in a Dataset of :func:`structures`."""
+def poses_in(result: xr.Dataset, k: int, vertices: np.ndarray) -> Poses:
+    """Return the poses of structure k, with these vertices, from a result of :func:`structures`."""
     return Poses(
-        found["position"].values[here],
-        found["pose_rotation"].values[:, k],
-        found["pose_translation"].values[:, k],
-        found["within_displacement"].values[:, here],
+        result["position"].values[vertices],
+        result["pose_rotation"].values[:, k],
+        result["pose_translation"].values[:, k],
+        result["within_displacement"].values[:, vertices],
     )
 
 
-def places_of(found: xr.Dataset) -> list[tuple[int, np.ndarray]]:
-    """Number and vertices of each structure of a Dataset of :func:`structures`."""
-    of = found["structure_of_vertex"].values
-    return [(k, np.flatnonzero(of == k)) for k in range(found.sizes["structure"])]
+def vertices_of(result: xr.Dataset) -> list[np.ndarray]:
+    """Return the vertices of each structure in a result of :func:`structures`."""
+    structure = result["structure_of_vertex"].values
+    return [np.flatnonzero(structure == k) for k in range(result.sizes["structure"])]
 
 
 def pose_fields(
     mean: np.ndarray, area: np.ndarray, rotation: np.ndarray, translation: np.ndarray
 ) -> np.ndarray:
-    """Displacements of a mean shape by poses, to first order: w x (S - g) + t, ``(s, n, 3)``.
+    """Return displacements of a mean shape by poses, w x (S - g) + t, ``(s, n, 3)``.
 
     Examples
     --------
@@ -200,21 +204,21 @@ def pose_fields(
 def structures(
     study: xr.DataTree,
     *,
-    scale: bool = False,
+    remove_size: bool = False,
     n_permutations: int = 999,
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """How much do structures vary in how they lie beside each other, and how much in their shape?
+    """Separate the variation of structures in relative pose from that in shape.
 
     Parameters
     ----------
     study : DataTree
-        Of several structures, see :func:`s4a_morphometrics.analyse_structures`.
-    scale : bool
-        Whether the size of each subject, all structures together, is taken out.
+        From :func:`s4a_morphometrics.analyse_structures`.
+    remove_size : bool
+        Remove the size of each subject, all structures together.
     n_permutations : int
-        Of the subjects, for whether poses and shapes vary together.
+        Permutations of the subjects in the test of covariation of poses and shapes.
     seed, rng : see :mod:`s4a.seeds`
 
     Returns
@@ -222,29 +226,40 @@ def structures(
     Dataset
         ``position(vertex, xyz)``, the mean shapes of all structures in their mean poses as one
         mesh, ``vertex_area`` and ``structure_of_vertex``.
-        ``pose_rotation(shape, structure, xyz)``, vectors around the structure's centroid in the
-        frame of the mean subject, ``pose_translation`` and ``pose_size``, the root mean square
-        displacement that they are;
+        ``pose_rotation(shape, structure, xyz)``, rotation vectors about the structure's centroid in
+        the frame of the mean subject, ``pose_translation`` and ``pose_size``, the root mean square
+        displacement by both;
         ``within_displacement(shape, vertex, xyz)``, the shapes without their poses.
         ``level_variance(structure, level)`` of both levels, mean square over the area of all
-        structures, and ``level_share``, which add up to 1.  Of the joint components ``score``,
-        ``standard_deviation``, ``explained_variance_ratio`` and ``between_share(component)``, how
-        much of each is of poses.  ``pose_shape_rv`` of poses and shapes and its ``pose_shape_p``
-        (:mod:`s4a_morphometrics.two_block`); NaN where one of both does not vary.
-        A shape is a subject; those without all structures are left out, with a warning.
+        structures, and ``level_share``, which add up to 1.  ``score``, ``standard_deviation``,
+        ``explained_variance_ratio`` and ``between_share(component)``, the share of poses, of the
+        joint components.  ``pose_shape_rv``, the RV coefficient of poses and shapes, and its
+        ``pose_shape_p``; NaN if one of the two does not vary.
+        A shape is a subject; subjects that lack a structure are left out, with a warning.
 
     Raises
     ------
     ValueError
-        When the study is not of several structures, fewer than 4 subjects have all of them, their
-        units differ, or nothing varies.
+        If the study has one structure only, fewer than 4 subjects have all structures, units
+        differ, or nothing varies.
+
+    See Also
+    --------
+    structures_modes : modes of variation of one level.
+    structures_of_new : poses and shapes of new subjects.
+    s4a_morphometrics.two_block : the RV coefficient and its test.
 
     Notes
     -----
-    The shares are of what was registered: noise of the registration is within structures.  Size of
-    a structure is within; what all structures share as size of the whole too, unless `scale`.
-    Where scans of one subject were moved apart, as when every file is centred, poses are lost and
-    nothing here can know it but where all centres coincide, which is reported.
+    Noise of the registration counts as variation within structures.  So does the size of each
+    structure, also the size that all structures share, unless `remove_size`.  If the surfaces of a
+    subject are not in one frame, for example because every file was centred, the relative poses are
+    lost.  This is reported only if all centres coincide.
+
+    References
+    ----------
+    M. N. Bossa and S. Olmos (2006), Statistical model of similarity transformations; M. E.
+    Timmerman (2006), Multilevel component analysis; see :mod:`s4a_morphometrics.poses`.
 
     Examples
     --------
@@ -253,13 +268,13 @@ def structures(
     >>> import s4a_morphometrics
     >>> from s4a_morphometrics.synthetic import example_structures
     >>> study = example_structures()
-    >>> found = s4a_morphometrics.structures(study, n_permutations=99)
-    >>> float(found["level_share"].sum().round(6)), found.sizes["shape"]
+    >>> result = s4a_morphometrics.structures(study, n_permutations=99)
+    >>> float(result["level_share"].sum().round(6)), result.sizes["shape"]
     (1.0, 6)
     """
     seed = seed_of(seed, rng)
     check_permutations(n_permutations)
-    check_switch("scale", scale)
+    check_switch("remove_size", remove_size)
     names = structure_names(study)
     registered = {name: registration_of(of_structure(study, name)) for name in names}
     shapes = shared_subjects(registered)
@@ -267,62 +282,62 @@ def structures(
     meshes = [as_arrays(registered[name]) for name in names]
     areas = [vertex_areas(*mesh) for mesh in meshes]
     Y = [
-        np.stack([image_in_shape(mesh[0], registered[name].sel(shape=one)) for one in shapes])
+        np.stack([image_in_shape(mesh[0], registered[name].sel(shape=shape)) for shape in shapes])
         for name, mesh in zip(names, meshes, strict=True)
     ]
     report_frames(names, Y, areas)
     counts = [len(area) for area in areas]
-    places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+    vertices = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
     area = np.concatenate(areas)
-    whole = align_wholes(np.concatenate(Y, axis=1), area, scale=scale)
+    whole = align_wholes(np.concatenate(Y, axis=1), area, remove_size=remove_size)
     del Y
-    each = [poses_of(whole[:, place], area[place]) for place in places]
+    each = [poses_of(whole[:, v], area[v]) for v in vertices]
     report_poses(names, shapes, each, areas, each)
-    triangles = [T + place[0] for (_, T), place in zip(meshes, places, strict=True)]
-    result = measured(each, areas, n_permutations=n_permutations, seed=seed)
+    triangles = [T + v[0] for (_, T), v in zip(meshes, vertices, strict=True)]
+    result = measure_levels(each, areas, n_permutations=n_permutations, seed=seed)
     mesh = as_dataset(
-        np.concatenate([one.mean for one in each]), np.concatenate(triangles), vertex_area=area
+        np.concatenate([poses.mean for poses in each]), np.concatenate(triangles), vertex_area=area
     )
     result = in_unit(result.merge(mesh), unit)
     return result.assign_coords(shape=shapes, structure=names, level=list(LEVELS[1:])).assign_attrs(
-        scale=str(scale), permutations=n_permutations
+        remove_size=str(remove_size), permutations=n_permutations
     )
 
 
-def measured(
+def measure_levels(
     each: list[Poses], areas: list[np.ndarray], *, n_permutations: int = 999, seed: int = 0
 ) -> xr.Dataset:
-    """All that :func:`structures` says of the poses and shapes of some structures."""
+    """Return the variables of :func:`structures` for the poses and shapes of some structures."""
     total = float(sum(area.sum() for area in areas))
     s = len(each[0].rotation)
     kernels = np.empty((len(each), 2, s, s))  # inner products of poses, of shapes
     size = np.empty((s, len(each)))
     fields = []
     reach = 0.0  # mean square distance from the origin
-    for k, (one, area) in enumerate(zip(each, areas, strict=True)):
-        d = pose_fields(one.mean, area, one.rotation, one.translation)
-        of_poses = gram(d, area)
-        size[:, k] = np.sqrt(np.diag(of_poses))
-        part = area.sum() / total
-        kernels[k] = part * center_gram(of_poses), part * center_gram(gram(one.shape, area))
+    for k, (poses, area) in enumerate(zip(each, areas, strict=True)):
+        d = pose_fields(poses.mean, area, poses.rotation, poses.translation)
+        pose_gram = gram(d, area)
+        size[:, k] = np.sqrt(np.diag(pose_gram))
+        share = area.sum() / total
+        kernels[k] = share * center_gram(pose_gram), share * center_gram(gram(poses.shape, area))
         fields.append(d)
-        reach += float((one.mean**2).sum(1) @ area) / total
+        reach += float((poses.mean**2).sum(1) @ area) / total
     variance = np.trace(kernels, axis1=2, axis2=3) / (s - 1)  # (structure, level)
     K = kernels.sum((0, 1))
     if variance.sum() <= 1e-18 * reach:
         raise ValueError("structures need subjects that differ; all are equal")
     values, V = principal_components(K)
-    share_of_poses = np.einsum("sc,st,tc->c", V, kernels[:, 0].sum(0), V) / (values * (s - 1))
+    between_share = np.einsum("sc,st,tc->c", V, kernels[:, 0].sum(0), V) / (values * (s - 1))
     rv: float | np.ndarray = np.nan
     p: float | np.ndarray = np.nan
-    of_level = variance.sum(0)
-    if of_level.min() > 1e-15 * of_level.max():
+    totals = variance.sum(0)
+    if totals.min() > 1e-15 * totals.max():
         all_areas = np.concatenate(areas)
-        blocks = (np.concatenate(fields, 1), np.concatenate([one.shape for one in each], 1))
+        blocks = (np.concatenate(fields, 1), np.concatenate([poses.shape for poses in each], 1))
         A, B = (coordinates(block, all_areas / total) for block in blocks)
-        found = two_block(A, B, n_permutations=n_permutations, seed=seed)
-        rv, p = found["rv"], found["rv_p"]
-    counts = [len(one.mean) for one in each]
+        pls = two_block(A, B, n_permutations=n_permutations, seed=seed)
+        rv, p = pls["rv"], pls["rv_p"]
+    counts = [len(poses.mean) for poses in each]
     return dataset(
         structure_of_vertex=np.repeat(np.arange(len(each)), counts),
         pose_rotation=np.stack([one.rotation for one in each], axis=1),
@@ -334,139 +349,146 @@ def measured(
         score=V * np.sqrt(s - 1),
         standard_deviation=np.sqrt(values),
         explained_variance_ratio=values / values.sum(),
-        between_share=share_of_poses,
+        between_share=between_share,
         pose_shape_rv=rv,
         pose_shape_p=p,
     )
 
 
-def structures_of_new(found: xr.Dataset, inserted: xr.DataTree) -> xr.Dataset:
-    """How the structures of new subjects lie beside each other, and their shapes.
+def structures_of_new(result: xr.Dataset, inserted: xr.DataTree) -> xr.Dataset:
+    """Return relative poses and shapes of the structures of new subjects.
 
-    Each new subject is moved as a whole onto the mean of those of the study, which stays as it is;
-    then the pose of each structure is that on its mean shape.  A subject of the study itself comes
-    out as it is there.
+    Each new subject is aligned as a whole to the mean of the study, which stays unchanged; the
+    pose of each structure is relative to its mean shape.  For a subject of the study the result is
+    that of :func:`structures`.
 
     Parameters
     ----------
-    found : Dataset
-        Of :func:`structures`, of the study.
+    result : Dataset
+        From :func:`structures`, for the study.
     inserted : DataTree
-        Of :func:`s4a_morphometrics.insert_structures` into the same study.
+        From :func:`s4a_morphometrics.insert_structures` into the same study.
 
     Returns
     -------
     Dataset
         ``pose_rotation``, ``pose_translation``, ``pose_size`` and ``within_displacement`` of the
-        new subjects, and the mean shapes of the study, as of :func:`structures`;
-        :func:`structures_modes` has their scores.  Those without all structures are left out, with
-        a warning.
+        new subjects, and the mean shapes of the study, as in :func:`structures`.  Subjects that
+        lack a structure are left out, with a warning.
 
     Raises
     ------
     ValueError
-        When a structure of the study has no new shape, no new subject has all of them, or these
-        were registered to another template or in another unit.
+        If a structure of the study has no new shape, no new subject has all structures, or the
+        shapes were registered to another template or in another unit.
+
+    See Also
+    --------
+    structures_modes : scores of the new subjects.
 
     Examples
     --------
-    With a ``study`` of two small structures of six subjects, of which one is given once more:
+    With a ``study`` of two small structures of six subjects, inserted into itself:
 
     >>> import s4a_morphometrics
     >>> from s4a_morphometrics.synthetic import example_structures
     >>> study = example_structures()
-    >>> found = s4a_morphometrics.structures(study, n_permutations=99)
-    >>> new = s4a_morphometrics.structures_of_new(found, study)
-    >>> bool(abs(new["pose_size"] - found["pose_size"]).max() < 1e-4 * found["pose_size"].max())
+    >>> result = s4a_morphometrics.structures(study, n_permutations=99)
+    >>> new = s4a_morphometrics.structures_of_new(result, study)
+    >>> bool(abs(new["pose_size"] - result["pose_size"]).max() < 1e-4 * result["pose_size"].max())
     True
     """
-    names = found["structure"].values.tolist()
+    names = result["structure"].values.tolist()
     if structure_names(inserted) != names:
         raise ValueError(
             f"new shapes of {listed(names)} needed, found {listed(structure_names(inserted))}"
         )
     registered = {name: registration_of(of_structure(inserted, name)) for name in names}
     shapes = shared_subjects(registered, least=1)
-    unit = unit_of(found["position"])
+    unit = unit_of(result["position"])
     if shared_unit(registered) != unit:
         raise ValueError(f"new shapes in {unit} needed, found {shared_unit(registered)}")
-    places = places_of(found)
-    counts = [len(here) for _, here in places]
+    vertices = vertices_of(result)
+    counts = [len(v) for v in vertices]
     others = [registered[name].sizes["vertex"] for name in names]
     if others != counts:
         raise ValueError(
             "shapes inserted into the same study needed, with templates of "
             f"{listed([str(n) for n in counts])} vertices; found {listed([str(n) for n in others])}"
         )
-    area, known = found["vertex_area"].values, wholes_of(found)
+    area, aligned = result["vertex_area"].values, wholes_of(result)
     w = area / area.sum()
-    mean = known.mean(0)
-    center, size = w @ mean, np.sqrt(w @ (known[0] ** 2).sum(1))
+    mean = aligned.mean(0)
+    center, size = w @ mean, np.sqrt(w @ (aligned[0] ** 2).sum(1))
     whole = np.empty((len(shapes), len(mean), 3))
-    for i, one in enumerate(shapes):
-        parts = [registered[name].sel(shape=one) for name in names]
+    for i, shape in enumerate(shapes):
+        parts = [registered[name].sel(shape=shape) for name in names]
         Y = np.concatenate([image_in_shape(part["position"].values, part) for part in parts])
         Y -= w @ Y
         R, _, _ = rigid_transform(Y, mean, w)
-        if found.attrs["scale"] == "True":
-            Y *= size / np.sqrt(w @ (Y**2).sum(1))  # all of the study have the same
+        if result.attrs["remove_size"] == "True":
+            Y *= size / np.sqrt(w @ (Y**2).sum(1))  # all subjects of the study have one size
         whole[i] = Y @ R.T + center
-    each = [poses_on(found["position"].values[at], whole[:, at], area[at]) for _, at in places]
-    usual = [poses_in(found, k, at) for k, at in places]
-    report_poses(names, shapes, each, [area[at] for _, at in places], usual)
+    each = [poses_on(result["position"].values[v], whole[:, v], area[v]) for v in vertices]
+    usual = [poses_in(result, k, v) for k, v in enumerate(vertices)]
+    report_poses(names, shapes, each, [area[v] for v in vertices], usual)
     d = [
-        pose_fields(one.mean, area[at], one.rotation, one.translation)
-        for (_, at), one in zip(places, each, strict=True)
+        pose_fields(poses.mean, area[v], poses.rotation, poses.translation)
+        for v, poses in zip(vertices, each, strict=True)
     ]
-    of_area = [area[at] / area[at].sum() for _, at in places]
-    size = [np.sqrt(np.einsum("snx,n->s", f**2, a)) for f, a in zip(d, of_area, strict=True)]
+    weights = [area[v] / area[v].sum() for v in vertices]
+    size = [np.sqrt(np.einsum("snx,n->s", f**2, a)) for f, a in zip(d, weights, strict=True)]
     new = dataset(
         pose_rotation=np.stack([one.rotation for one in each], axis=1),
         pose_translation=np.stack([one.translation for one in each], axis=1),
         pose_size=np.stack(size, axis=1),
         within_displacement=np.concatenate([one.shape for one in each], 1).astype(np.float32),
     )
-    mesh = found[["position", "corner_vertex", "vertex_area", "structure_of_vertex"]]
+    mesh = result[["position", "corner_vertex", "vertex_area", "structure_of_vertex"]]
     mesh = mesh.drop_vars(["shape", "level"], errors="ignore")
-    result = in_unit(mesh.merge(new), unit).assign_coords(shape=shapes, structure=names)
-    return result.assign_attrs(scale=found.attrs["scale"])
+    new = in_unit(mesh.merge(new), unit).assign_coords(shape=shapes, structure=names)
+    return new.assign_attrs(remove_size=result.attrs["remove_size"])
 
 
 def structures_modes(
-    study: xr.DataTree, found: xr.Dataset, level: str = "joint", new: xr.Dataset | None = None
+    study: xr.DataTree, result: xr.Dataset, level: str = "joint", new: xr.Dataset | None = None
 ) -> xr.DataTree:
-    """One level of :func:`structures` as a study of all structures together.
+    """Return one level of :func:`structures` as a study of all structures together.
 
-    Everything that takes a study takes it: its modes are those of the level, and so are groups,
-    variables and maps, such as :func:`s4a.statistics.group_test` of how structures lie.
+    Every function that takes a study accepts it.  For example, :func:`s4a.statistics.group_test`
+    of the level "between" tests groups for differences in relative pose.
 
     Parameters
     ----------
     study : DataTree
-        Of several structures.
-    found : Dataset
-        Of :func:`structures`.
+        From :func:`s4a_morphometrics.analyse_structures`.
+    result : Dataset
+        From :func:`structures`.
     level : {"joint", "between", "within"}
-        Poses and shapes; poses alone; shapes alone.
+        Poses and shapes, poses only, or shapes only.
     new : Dataset, optional
-        Of :func:`structures_of_new`: the shapes of the tree are these, and their scores are those
-        on the modes of the study, as of :func:`s4a_morphometrics.insert_structures`.
+        From :func:`structures_of_new`: the tree then has the new shapes, with their scores on the
+        modes of the study.
 
     Returns
     -------
     DataTree
-        ``/registration`` with all structures as one mesh, a shape each subject, and its
+        ``/registration`` with all structures as one mesh, one shape per subject, and its
         displacements; ``/pca``; and ``/subjects``, the columns in which all structures of a
         subject agree.
 
     Raises
     ------
     ValueError
-        When there is no such level, or it does not vary.
+        If there is no such level, or it does not vary.
+
+    See Also
+    --------
+    structures : the decomposition into levels.
 
     Notes
     -----
-    Turns are drawn along their tangents: at 15 degrees a structure looks 3 % larger.
+    Rotations are drawn to first order: at 15 degrees a structure appears 3 % larger.
 
     Examples
     --------
@@ -475,86 +497,90 @@ def structures_modes(
     >>> import s4a_morphometrics
     >>> from s4a_morphometrics.synthetic import example_structures
     >>> study = example_structures()
-    >>> found = s4a_morphometrics.structures(study, n_permutations=99)
-    >>> poses = s4a_morphometrics.structures_modes(study, found, "between")
+    >>> result = s4a_morphometrics.structures(study, n_permutations=99)
+    >>> poses = s4a_morphometrics.structures_modes(study, result, "between")
     >>> poses["pca"].sizes["component"]
     5
     """
     if level not in LEVELS:
         raise ValueError(f"level must be one of {', '.join(LEVELS)}; found {level!r}")
-    registration = of_level(found, level)
+    registration = level_registration(result, level)
     try:
-        modes = pca(registration, found["vertex_area"].values)
+        modes = pca(registration, result["vertex_area"].values)
     except ValueError as error:
         raise ValueError(f"{level}: {error}") from error
     modes = modes.assign_attrs(variable=level)
     if new is not None:
-        registration = of_level(new, level)
-        modes = scores_of_new(modes, registration, found["vertex_area"].values)
+        registration = level_registration(new, level)
+        modes = scores_of_new(modes, registration, result["vertex_area"].values)
     nodes = {"/registration": registration, "/pca": modes}
     subjects = (
-        xr.Dataset() if new is not None else shared_columns(study, found["shape"].values.tolist())
+        xr.Dataset() if new is not None else shared_columns(study, result["shape"].values.tolist())
     )
     if subjects.data_vars:
         nodes["/subjects"] = subjects
     return xr.DataTree.from_dict(nodes, name=study.name)
 
 
-def of_level(found: xr.Dataset, level: str) -> xr.Dataset:
-    """The displacements of one level, on all structures as one mesh."""
-    area = found["vertex_area"].values
-    d = np.zeros(found["within_displacement"].shape)
+def level_registration(result: xr.Dataset, level: str) -> xr.Dataset:
+    """Return the displacements of one level, on all structures as one mesh."""
+    area = result["vertex_area"].values
+    d = np.zeros(result["within_displacement"].shape)
     if level != "between":
-        d += found["within_displacement"].values
+        d += result["within_displacement"].values
     if level != "within":
-        for k, here in places_of(found):
-            d[:, here] += pose_fields(
-                found["position"].values[here],
-                area[here],
-                found["pose_rotation"].values[:, k],
-                found["pose_translation"].values[:, k],
+        for k, vertices in enumerate(vertices_of(result)):
+            d[:, vertices] += pose_fields(
+                result["position"].values[vertices],
+                area[vertices],
+                result["pose_rotation"].values[:, k],
+                result["pose_translation"].values[:, k],
             )
-    mesh = found[["position", "corner_vertex", "vertex_area", "structure_of_vertex"]]
-    registration = mesh.assign_attrs(level=level, structures=" ".join(found["structure"].values))
+    mesh = result[["position", "corner_vertex", "vertex_area", "structure_of_vertex"]]
+    registration = mesh.assign_attrs(level=level, structures=" ".join(result["structure"].values))
     registration = registration.merge(dataset(displacement=d.astype(np.float32)))
-    registration = in_unit(registration, unit_of(found["position"]))
+    registration = in_unit(registration, unit_of(result["position"]))
     registration = registration.drop_vars(["structure", "level"], errors="ignore")
-    return registration.assign_coords(shape=found["shape"].values)
+    return registration.assign_coords(shape=result["shape"].values)
 
 
-# what the structures of a subject share
+# subjects and columns that all structures have in common
 
 
 def shared_subjects(registered: dict[str, xr.Dataset], least: int = 4) -> list[str]:
-    """The subjects of which all structures are registered; the others are named in a warning."""
+    """Return subjects with all structures registered; a warning names the others."""
     having = {name: data["shape"].values.tolist() for name, data in registered.items()}
-    everyone = sorted({one for names in having.values() for one in names})
-    lacking = {one: [name for name, of in having.items() if one not in of] for one in everyone}
-    shapes = [one for one, without in lacking.items() if not without]
-    said = [f"{one} (no {listed(names)})" for one, names in lacking.items() if names]
-    if said:
+    everyone = sorted({subject for subjects in having.values() for subject in subjects})
+    lacking = {
+        subject: [name for name, subjects in having.items() if subject not in subjects]
+        for subject in everyone
+    }
+    complete = [subject for subject, names in lacking.items() if not names]
+    others = [f"{subject} (no {listed(names)})" for subject, names in lacking.items() if names]
+    if others:
         log.warning(
-            "left out, as a structure is missing or flagged: %s", listed(said, "; ", most=9)
+            "left out, because a structure is missing or flagged: %s",
+            listed(others, "; ", most=9),
         )
-    if len(shapes) < least:
+    if len(complete) < least:
         raise ValueError(
-            f"structures need at least {least} subjects that have all of them, found "
-            f"{len(shapes)} of {len(everyone)}{'; ' if said else ''}{listed(said, '; ')}"
+            f"at least {least} subjects with all structures needed, found "
+            f"{len(complete)} of {len(everyone)}{'; ' if others else ''}{listed(others, '; ')}"
         )
-    return shapes
+    return complete
 
 
 def shared_unit(registered: dict[str, xr.Dataset]) -> str:
-    """The unit of all structures; ValueError where they differ."""
+    """Return the unit of all structures; ValueError if units differ."""
     units = {name: unit_of(data["displacement"]) for name, data in registered.items()}
     if len(set(units.values())) > 1:
-        said = [f"{name}: {unit}" for name, unit in units.items()]
-        raise ValueError(f"structures need one unit; found {listed(said)}")
+        each = [f"{name}: {unit}" for name, unit in units.items()]
+        raise ValueError(f"structures need one unit; found {listed(each)}")
     return next(iter(units.values()))
 
 
 def shared_columns(study: xr.DataTree, shapes: list[str]) -> xr.Dataset:
-    """The columns of ``/subjects`` in which all structures of each subject have the same value."""
+    """Return columns of ``/subjects`` in which all structures of each subject agree."""
     tables = []
     for name in structure_names(study):
         part = of_structure(study, name)
@@ -570,14 +596,14 @@ def shared_columns(study: xr.DataTree, shapes: list[str]) -> xr.Dataset:
     return xr.Dataset(same, {"shape": shapes}, first.attrs)
 
 
-def _same(one, other):
-    if {one.dtype.kind, other.dtype.kind} <= set("iuf"):
-        return np.array_equal(one.values, other.values, equal_nan=True)
-    return np.array_equal(one.values, other.values)
+def _same(a, b):
+    if {a.dtype.kind, b.dtype.kind} <= set("iuf"):
+        return np.array_equal(a.values, b.values, equal_nan=True)
+    return np.array_equal(a.values, b.values)
 
 
 def report_frames(names: list[str], Y: list[np.ndarray], areas: list[np.ndarray]) -> None:
-    """Warn where structures seem not to lie in one frame, or not to have one unit."""
+    """Warn if structures do not seem to be in one frame, or in one unit."""
     centre = [np.einsum("n,snx->sx", a / a.sum(), y) for y, a in zip(Y, areas, strict=True)]
     size = [
         np.sqrt(np.einsum("n,snx->s", a / a.sum(), (y - c[:, None]) ** 2)).mean()
@@ -594,8 +620,8 @@ def report_frames(names: list[str], Y: list[np.ndarray], areas: list[np.ndarray]
     for k in range(1, len(names)):
         if np.linalg.norm(centre[k] - centre[0], axis=1).max() < SAME_CENTRE * size[smallest]:
             log.warning(
-                "%s and %s have the same centre in every subject: were their files centred, so "
-                "that how they lie relative to each other is lost?",
+                "%s and %s have the same centre in every subject: were their files centred? Then "
+                "their relative pose is lost",
                 names[0],
                 names[k],
             )
@@ -608,28 +634,28 @@ def report_poses(
     areas: list[np.ndarray],
     usual_poses: list[Poses],
 ) -> None:
-    """Warn of structures that lie far from where they usually are."""
+    """Warn about structures with an unusual pose."""
     far = np.zeros((len(shapes), len(names)))
 
-    def distances(one, others, area):
-        turn = one.rotation - np.median(others.rotation, axis=0)
-        shift = one.translation - np.median(others.translation, axis=0)
-        d = pose_fields(one.mean, area, turn, shift)
+    def distances(poses, reference, area):
+        rotation = poses.rotation - np.median(reference.rotation, axis=0)
+        translation = poses.translation - np.median(reference.translation, axis=0)
+        d = pose_fields(poses.mean, area, rotation, translation)
         return np.sqrt(np.einsum("n,snx->s", area / area.sum(), d**2))
 
-    for k, (one, others, area) in enumerate(zip(each, usual_poses, areas, strict=True)):
-        away = distances(one, others, area)
-        arm = one.mean - (area / area.sum()) @ one.mean
+    for k, (poses, reference, area) in enumerate(zip(each, usual_poses, areas, strict=True)):
+        distance = distances(poses, reference, area)
+        arm = poses.mean - (area / area.sum()) @ poses.mean
         size = np.sqrt((area / area.sum()) @ (arm**2).sum(1))
-        usual = max(FAR * np.median(distances(others, others, area)), LEAST * size)
-        far[:, k] = np.where(away > usual, away / size, 0)
-    said = [
+        limit = max(FAR * np.median(distances(reference, reference, area)), LEAST * size)
+        far[:, k] = np.where(distance > limit, distance / size, 0)
+    unusual = [
         f"{shapes[i]} ({names[int(far[i].argmax())]}, by {far[i].max():.1f} of its radius)"
         for i in np.flatnonzero(far.any(1))
     ]
-    if said:
+    if unusual:
         log.warning(
-            "structures lie far from where they are in the other subjects, as if in another frame, "
-            "mirrored or of another subject: %s",
-            listed(said, "; ", most=9),
+            "structures with an unusual relative pose, as if in another frame, mirrored or of "
+            "another subject: %s",
+            listed(unusual, "; ", most=9),
         )

@@ -1,6 +1,6 @@
-"""A study in the files of other programs (4.3, 6.1, 6.2), from one verb: :func:`write_for`.
+"""Export of a study to other programs (4.3, 6.1, 6.2) by one function, :func:`write_for`.
 
-What each file holds, in which unit and frame, is on the page *For other programs*.
+The page *For other programs* describes the files, their units and frames.
 """
 
 import inspect
@@ -31,7 +31,7 @@ from s4a_morphometrics.scalismo import write_scalismo
 
 log = logging.getLogger(__name__)
 
-N_POINTS = 500  # of a shape, where a program takes points one by one
+N_POINTS = 500  # points per shape for programs that work on points
 R_SCRIPT = """\
 library(ncdf4)
 nc <- nc_open("shapes.nc")
@@ -54,13 +54,13 @@ def write_for(study: xr.DataTree, folder: Path | str, program: str, **options: A
     study : DataTree
         With ``/original`` and ``/registration``; Scalismo and ParaView need ``/pca``.
     folder : path
-        Made where it is missing.
+        Created if missing.
     program : {"slicer", "shapeworks", "scalismo", "paraview", "r", "nifti"}
         See :func:`write_slicer`, :func:`write_shapeworks`,
         :func:`s4a_morphometrics.scalismo.write_scalismo`, :func:`write_paraview`, :func:`write_r`
         and :func:`s4a.analysis.volumes.write_label_volumes`.
     **options
-        Those of that function.
+        Options of that function.
 
     Returns
     -------
@@ -69,7 +69,12 @@ def write_for(study: xr.DataTree, folder: Path | str, program: str, **options: A
     Raises
     ------
     ValueError
-        When the program is none of these, takes no such option, or the study lacks what it needs.
+        If the program is unknown, has no such option, or the study lacks a node that it needs.
+
+    See Also
+    --------
+    write_training_set : labelled meshes for machine learning.
+    s4a_morphometrics.scalismo.read_scalismo : reads a statistical shape model.
 
     Examples
     --------
@@ -85,11 +90,11 @@ def write_for(study: xr.DataTree, folder: Path | str, program: str, **options: A
     if program not in PROGRAMS:
         raise ValueError(f"program must be one of {', '.join(PROGRAMS)}; found {program!r}")
     writer = PROGRAMS[program]
-    known = [name for name in inspect.signature(writer).parameters if name not in LEADING]
-    wrong = [name for name in options if name not in known]
+    accepted = [name for name in inspect.signature(writer).parameters if name not in LEADING]
+    wrong = [name for name in options if name not in accepted]
     if wrong:
         raise ValueError(
-            f"{program} takes the options {', '.join(known)}; found {', '.join(wrong)}"
+            f"{program} takes the options {', '.join(accepted)}; found {', '.join(wrong)}"
         )
     return writer(study, Path(folder), **options)
 
@@ -104,18 +109,19 @@ def write_slicer(
     n_points: int = N_POINTS,
     landmarks: xr.Dataset | None = None,
 ) -> list[Path]:
-    """Write registered surfaces and points for 3D Slicer and SlicerMorph, where the files lie.
+    """Write registered surfaces and points for 3D Slicer, each in the frame of its file.
 
     Parameters
     ----------
     study : DataTree
     folder : path
-        Gets, for every shape, ``<shape>.vtk`` with its ``confidence``, ``points/<shape>.mrk.json``,
-        which SlicerMorph's GPA takes as landmarks, and ``landmarks/<shape>.mrk.json``.
+        Receives, for every shape, ``<shape>.vtk`` with its ``confidence``,
+        ``points/<shape>.mrk.json``, the landmarks for SlicerMorph's GPA, and
+        ``landmarks/<shape>.mrk.json``.
     n_points : int
-        Vertices that are points, as far apart as can be; the same ones on every shape.
+        Number of farthest-point samples, the same vertices on every shape.
     landmarks : Dataset, optional
-        Of the template, by default those of its file; transferred to all shapes.
+        Landmarks of the template, by default those of its file; transferred to all shapes.
 
     Returns
     -------
@@ -124,33 +130,33 @@ def write_slicer(
     registration, X, T, chosen = _parts(study, n_points)
     folder = _folders(folder, "points")
     name = registration.attrs["template"]
-    own_marks = landmarks is None and "landmark_position" in study["original"][name]
-    landmarks = study["original"][name].to_dataset() if own_marks else landmarks
-    carried: dict[str, xr.Dataset] = {}
+    from_file = landmarks is None and "landmark_position" in study["original"][name]
+    landmarks = study["original"][name].to_dataset() if from_file else landmarks
+    transferred: dict[str, xr.Dataset] = {}
     if landmarks is not None:
         (folder / "landmarks").mkdir(exist_ok=True)
         others = transfer_landmarks(study, landmarks).children
-        if not own_marks:  # on the surface and in its coordinates, as on all others
+        if not from_file:  # project them to the surface, as on all other shapes
             landmarks = locate(landmarks, study["original"][name].to_dataset())
-        carried = {name: landmarks} | {other: node.to_dataset() for other, node in others.items()}
+        transferred = {name: landmarks}
+        transferred |= {other: node.to_dataset() for other, node in others.items()}
     unit, paths, unknown = unit_of(registration["displacement"]), [], []
     names = np.array([str(vertex) for vertex in chosen.tolist()])
     for shape in registration["shape"].values.tolist():
-        own = registration.sel(shape=shape)
-        points, triangles, system = _in_file(study, shape, X, T, own)
+        registered = registration.sel(shape=shape)
+        points, triangles, system = _in_file(study, shape, X, T, registered)
         unknown += [] if system else [shape]
         paths.append(folder / f"{shape}.vtk")
         title = f"S4A; SPACE={system}" if system else "S4A"
-        scalars = {"confidence": own["confidence"].values}
+        scalars = {"confidence": registered["confidence"].values}
         paths[-1].write_bytes(vtk_bytes(points, triangles, scalars, title))
         lists = {"points": dataset(landmark_name=names, landmark_position=points[chosen])}
-        if shape in carried:
-            kept = [n for n in carried[shape] if str(n) in MARKS]
-            marks = carried[shape][kept].drop_attrs()
-            place = in_file(
-                study["original"][shape].to_dataset(), marks["landmark_position"].values
-            )
-            marks["landmark_position"] = variable("landmark_position", place)
+        if shape in transferred:
+            names_of_marks = [n for n in transferred[shape] if str(n) in MARKS]
+            marks = transferred[shape][names_of_marks].drop_attrs()
+            mesh = study["original"][shape].to_dataset()
+            position = in_file(mesh, marks["landmark_position"].values)
+            marks["landmark_position"] = variable("landmark_position", position)
             lists["landmarks"] = marks
         for kind, marks in lists.items():
             paths.append(folder / kind / f"{shape}.mrk.json")
@@ -172,19 +178,19 @@ MARKS = ("landmark_name", "landmark_position", "landmark_curve", "landmark_close
 def write_shapeworks(
     study: xr.DataTree, folder: Path | str, *, n_points: int = N_POINTS
 ) -> list[Path]:
-    """Write a project of ShapeWorks: the meshes, and corresponding vertices as particles.
+    """Write a ShapeWorks project: the meshes, and corresponding vertices as particles.
 
-    Local particles lie on the mesh of each shape; ``alignment_1`` takes them to the world, which
-    is the frame of the template.
+    Local particles are on the mesh of each shape; ``alignment_1`` transforms them to world
+    coordinates, the frame of the template.
 
     Parameters
     ----------
     study : DataTree
     folder : path
-        Gets ``study.swproj``, ``shapes/<shape>.ply`` (the cleaned mesh, mirrored where the run
+        Receives ``study.swproj``, ``shapes/<shape>.ply`` (the cleaned mesh, mirrored if the run
         mirrored it) and ``particles/<shape>_local.particles`` and ``_world.particles``.
     n_points : int
-        Particles of a shape, as far apart as can be.
+        Number of particles, farthest-point samples.
 
     Returns
     -------
@@ -195,21 +201,21 @@ def write_shapeworks(
     subjects = study["subjects"].to_dataset() if "subjects" in study.children else xr.Dataset()
     rows, paths = [], []
     for shape in registration["shape"].values.tolist():
-        own = registration.sel(shape=shape)
+        registered = registration.sel(shape=shape)
         mesh = f"shapes/{shape}.ply"
         write_mesh(folder / mesh, *as_arrays(study["original"][shape].to_dataset()))
         row = {"name": shape, "shape_1": mesh, "groomed_1": mesh}
-        R, t, s = (own[name].values for name in ("rotation", "translation", "scale"))
+        R, t, s = (registered[name].values for name in ("rotation", "translation", "scale"))
         M = np.eye(4)
         M[:3, :3], M[:3, 3] = s * R, t
         row["alignment_1"] = " ".join(map(repr, M.ravel().tolist()))
         row["procrustes_1"] = " ".join(map(repr, np.eye(4).ravel().tolist()))
-        points = {"local": image_in_shape(X, own), "world": X + own["displacement"].values}
+        local, world = image_in_shape(X, registered), X + registered["displacement"].values
         paths.append(folder / mesh)
-        for kind, place in points.items():
+        for kind, position in {"local": local, "world": world}.items():
             row[f"{kind}_particles_1"] = f"particles/{shape}_{kind}.particles"
             paths.append(folder / row[f"{kind}_particles_1"])
-            np.savetxt(paths[-1], place[chosen], fmt="%.9g")
+            np.savetxt(paths[-1], position[chosen], fmt="%.9g")
         rows.append(row | _cells(subjects, shape))
     project = {
         "data": rows,
@@ -223,7 +229,7 @@ def write_shapeworks(
 
 
 def _cells(subjects, shape):
-    """What the table says of a shape, as texts; columns of words are ShapeWorks's groups."""
+    """Return the table's row of a shape as texts; text columns become groups of ShapeWorks."""
     if "shape" not in subjects.coords or shape not in subjects["shape"].values:
         return {}
     row = subjects.sel(shape=shape)
@@ -241,19 +247,19 @@ def write_paraview(
     n_steps: int = 25,
     extent: float = 3.0,
 ) -> list[Path]:
-    """Write modes, and the registered shapes, as time series of ParaView, aligned to the template.
+    """Write modes and registered shapes, aligned to the template, as time series of ParaView.
 
     Parameters
     ----------
     study : DataTree
     folder : path
-        Gets ``mode_<i>.pvd``, whose time is the score in standard deviations, ``shapes.pvd``, whose
-        time is the place in the study, and folders of ``.vtp``: ``displacement`` from the mean
-        shape, ``along_normal``, positive where it is outwards, and ``confidence``.
+        Receives ``mode_<i>.pvd``, with the score in standard deviations as time; ``shapes.pvd``,
+        with the index in the study as time; and folders of ``.vtp`` files with ``displacement``
+        from the mean shape, ``along_normal``, positive outward, and ``confidence``.
     n_modes, n_steps : int
-        How many, and surfaces of each.
+        Number of modes, and of surfaces of each mode.
     extent : float
-        Scores go from minus to plus this.
+        Range of the scores, from -extent to extent.
 
     Returns
     -------
@@ -273,21 +279,21 @@ def write_paraview(
     series = {}
     for i in range(n_modes):
         scores = np.linspace(-extent, extent, n_steps)
-        moved = [
+        surfaces = [
             synthesize(study, np.eye(n_modes)[i] * score)["position"].values for score in scores
         ]
-        sure = [confidence.mean(0)] * n_steps
-        series[f"mode_{i + 1}"] = zip(scores.tolist(), moved, sure, strict=True)
+        mean_confidence = [confidence.mean(0)] * n_steps
+        series[f"mode_{i + 1}"] = zip(scores.tolist(), surfaces, mean_confidence, strict=True)
     shapes = X + registration["displacement"].values
     series["shapes"] = zip(range(len(shapes)), shapes, confidence, strict=True)
     folder = _folders(folder, *series)
     paths = []
     for name, steps in series.items():
         lines = []
-        for i, (time, position, sure) in enumerate(steps):
-            file, moved = f"{name}/{i:03d}.vtp", position - mean
-            along = (moved * normals).sum(1)
-            fields = {"displacement": moved, "along_normal": along, "confidence": sure}
+        for i, (time, position, at_vertices) in enumerate(steps):
+            file, d = f"{name}/{i:03d}.vtp", position - mean
+            along = (d * normals).sum(1)
+            fields = {"displacement": d, "along_normal": along, "confidence": at_vertices}
             (folder / file).write_bytes(vtp_bytes(position, T, fields))
             lines.append(f'<DataSet timestep="{time!r}" part="0" file="{file}"/>\n')
         paths.append(folder / f"{name}.pvd")
@@ -307,11 +313,11 @@ def write_r(study: xr.DataTree, folder: Path | str, *, n_points: int = N_POINTS)
     ----------
     study : DataTree
     folder : path
-        Gets ``shapes.nc`` (every vertex; R has its dims the other way round), ``points.tps`` (some
+        Receives ``shapes.nc`` (all vertices; R reverses the order of dims), ``points.tps`` (some
         vertices, for ``geomorph::readland.tps(file, specID = "ID")``), ``subjects.csv`` (a row per
-        shape, and the scores of its modes) and ``study.R``, which reads them.
+        shape, with its scores) and ``study.R``, a script that reads these files.
     n_points : int
-        Points of the TPS file, as far apart as can be.
+        Number of points in the TPS file, farthest-point samples.
 
     Returns
     -------
@@ -336,14 +342,14 @@ def write_r(study: xr.DataTree, folder: Path | str, *, n_points: int = N_POINTS)
         columns |= {str(name): table[name].values.tolist() for name in table.data_vars}
     if "pca" in study.children:
         scores = study["pca"].to_dataset()["score"].sel(shape=names).values
-        columns |= {f"component_{i}": of.tolist() for i, of in enumerate(scores.T, 1)}
+        columns |= {f"component_{i}": score.tolist() for i, score in enumerate(scores.T, 1)}
     write_table(paths[2], columns, zip(*columns.values(), strict=True))
     paths[3].write_text(R_SCRIPT, encoding="utf-8")
     return paths
 
 
 def _parts(study, n_points):
-    """The registration, the template ``X, T``, and so many of its vertices, far apart."""
+    """Return the registration, the template ``X, T``, and farthest-point samples of it."""
     check_count("n_points", n_points, 3)
     registration = registration_of(study)
     X, T = as_arrays(registration)
@@ -351,15 +357,15 @@ def _parts(study, n_points):
 
 
 def _folders(folder: Path | str, *names: str) -> Path:
-    """A folder with others in it, made where they are missing."""
+    """Create a folder with subfolders."""
     for path in (Path(folder), *(Path(folder) / name for name in names)):
         path.mkdir(parents=True, exist_ok=True)
     return Path(folder)
 
 
-def _in_file(study, name, X, T, own):
-    """The registered surface where the file of a shape lies, and the frame that the file says."""
-    points, triangles = image_in_shape(X, own), T
+def _in_file(study, name, X, T, registered):
+    """Return the registered surface in the frame of a shape's file, and the name of the frame."""
+    points, triangles = image_in_shape(X, registered), T
     if is_reflected(study, name):
         points, triangles = points * MIRROR, T[:, ::-1]
     return points, triangles, study["original"][name].attrs.get("coordinate_system", "")
@@ -377,25 +383,25 @@ def write_training_set(
     rng: RNG | None = None,
     **options: Any,
 ) -> dict[str, list[str]]:
-    """Write a training set for learners of segmentations and key-points, with its split.
+    """Write labelled meshes to train and test models of segmentation or landmark detection.
 
     Parameters
     ----------
     study : DataTree
         With ``/original`` and ``/registration``.
     folder : path
-        Gets ``meshes/<shape>.ply`` (the cleaned mesh, with all its vertices, in the coordinates of
-        its file, or their mirror image where the run took that), ``labels/<shape>.npy`` (one per
-        vertex) and ``labels/<shape>.confidence.npy`` (share of the votes times confidence of the
-        match), ``landmarks/<shape>.csv`` (name,x,y,z), and ``split.json`` with the lists ``train``
-        and ``test``.
+        Receives ``meshes/<shape>.ply`` (the cleaned mesh with all vertices, in the coordinates of
+        its file, or mirrored if the run mirrored it), ``labels/<shape>.npy`` (one per vertex) and
+        ``labels/<shape>.confidence.npy`` (share of the votes times confidence of the match),
+        ``landmarks/<shape>.csv`` (name,x,y,z), and ``split.json`` with the lists ``train`` and
+        ``test``.
     label, landmarks, source : see :func:`s4a.transfer_labels` and :func:`s4a.transfer_landmarks`
     test_share : float
-        Of the shapes, rounded up.
+        Share of shapes in the test set, rounded up.
     seed, rng : see :mod:`s4a.seeds`
-        Of the split.
+        For the split.
     **options
-        By which an external source is matched, see :func:`s4a.transfer_labels`.
+        Options to match an external source, see :func:`s4a.transfer_labels`.
 
     Returns
     -------
@@ -405,7 +411,12 @@ def write_training_set(
     Raises
     ------
     ValueError
-        When there is nothing to learn, or the share leaves no shape to train or to test on.
+        If neither labels nor landmarks are given, or no shape is left to train or to test on.
+
+    See Also
+    --------
+    s4a.transfer_labels, s4a.transfer_landmarks : transfer without files.
+    write_for : export to other programs.
 
     Examples
     --------
@@ -428,28 +439,28 @@ def write_training_set(
     n_test = int(np.ceil(test_share * len(names)))
     if not 0 < n_test < len(names):
         raise ValueError(
-            f"test_share needs a share of {len(names)} shapes that leaves some on both sides: "
-            f"{test_share}"
+            f"test_share must leave some of {len(names)} shapes for training and for testing; "
+            f"found {test_share}"
         )
-    where = {"source": source, "targets": names} | options
-    carried = {}  # before anything is written: it may fail
+    transfer = {"source": source, "targets": names} | options
+    transferred = {}  # before anything is written, because it may fail
     if label is not None:
-        carried["labels"] = transfer_labels(study, label, **where)
+        transferred["labels"] = transfer_labels(study, label, **transfer)
     if landmarks is not None:
-        carried["landmarks"] = transfer_landmarks(study, landmarks, **where)
-    for part in ("meshes", *carried):
+        transferred["landmarks"] = transfer_landmarks(study, landmarks, **transfer)
+    for part in ("meshes", *transferred):
         (folder / part).mkdir(parents=True, exist_ok=True)
     for name in names:
         mesh = study["original"][name].to_dataset()
         write_mesh(folder / "meshes" / f"{name}.ply", *as_arrays(mesh))
-        if "labels" in carried:
-            own = carried["labels"][name].to_dataset()
-            sure = own["label_share"] * own["confidence"]
-            np.save(folder / "labels" / f"{name}.npy", own["label"].values)
-            np.save(folder / "labels" / f"{name}.confidence.npy", sure.values)
-        if "landmarks" in carried:
+        if "labels" in transferred:
+            labels = transferred["labels"][name].to_dataset()
+            confidence = labels["label_share"] * labels["confidence"]
+            np.save(folder / "labels" / f"{name}.npy", labels["label"].values)
+            np.save(folder / "labels" / f"{name}.confidence.npy", confidence.values)
+        if "landmarks" in transferred:
             write_landmarks(
-                folder / "landmarks" / f"{name}.csv", carried["landmarks"][name].to_dataset()
+                folder / "landmarks" / f"{name}.csv", transferred["landmarks"][name].to_dataset()
             )
     order = np.random.default_rng(seed_of(seed, rng)).permutation(len(names))
     split = {

@@ -1,7 +1,7 @@
-"""Studies of a part of the variation (6.1): a region, without a nuisance, with size restored.
+"""Studies of a part of the variation (6.1): a region, nuisance regressed out, size restored.
 
-Each takes a study and gives one, with modes of its own, so that every test, measure, page and panel
-takes it; the study given stays as it is.  The alignment is that of the whole shapes.
+Each function takes a study and returns a new one with its own modes, for all tests, measures, pages
+and panels.  The original study stays unchanged.  The alignment is that of the whole shapes.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from s4a.input.subjects import listed
 from s4a.method.pca import gram, pca
 from s4a.schema import variable
 
-LEAST = 12  # vertices of a region
+LEAST = 12  # smallest number of vertices of a region
 
 
 def within(
@@ -39,26 +39,29 @@ def within(
     ----------
     study : DataTree
     region : bool array (vertex,), int, str or list of these, optional
-        Vertices of the template, as a mask; or those with this label, or one of these.  All by
-        default.
+        Vertices of the template: a mask, a label or several labels.  All by default.
     labels : ndarray (vertex,), optional
-        The labels of the template's vertices; by default those of ``/original/<template>``, which
-        has some where the mesh was given in memory with ``label``.
+        Labels of the template's vertices; by default ``label`` of ``/original/<template>``.
     min_confidence : float
-        Vertices whose mean ``confidence`` over the shapes is lower are left out, 0 to 1.
+        Leave out vertices whose mean ``confidence`` over the shapes is lower, 0 to 1.
 
     Returns
     -------
     DataTree
         ``/registration`` with these vertices and the triangles among them, ``/pca`` of their
-        displacements, and ``/subjects`` and ``/report``; ``template_vertex`` of ``/registration``
-        says which vertex of the template each is.
+        displacements, ``/subjects`` and ``/report``; ``template_vertex`` of ``/registration`` has
+        the vertex of the template for each vertex.
 
     Raises
     ------
     ValueError
-        When the mask is of another length, the template has no such label, or too few vertices or
+        If the mask has another length, the template has no such label, or too few vertices or
         triangles are left.
+
+    See Also
+    --------
+    s4a_morphometrics.Region : selects a region on the surface.
+    without, with_size : other restrictions of a study.
 
     Examples
     --------
@@ -78,7 +81,7 @@ def within(
         keep = keep & (registration["confidence"].mean("shape").values >= min_confidence)
     triangles = registration["corner_vertex"].values
     inside = keep[triangles].all(axis=1)
-    keep = np.isin(np.arange(len(keep)), triangles[inside])  # of a triangle in the region
+    keep = np.isin(np.arange(len(keep)), triangles[inside])  # vertices of triangles in the region
     if keep.sum() < LEAST:
         raise ValueError(
             f"a region needs at least {LEAST} vertices with triangles among them, found "
@@ -95,14 +98,14 @@ def within(
 
 
 def template_vertices(registration: xr.Dataset) -> np.ndarray:
-    """Which vertex of the template each vertex of a registration is ``(n,)``."""
-    if "template_vertex" in registration:  # of a region
+    """Return the vertex of the template for each vertex of a registration ``(n,)``."""
+    if "template_vertex" in registration:  # a region
         return np.asarray(registration["template_vertex"].values)
     return np.arange(registration.sizes["vertex"])
 
 
 def _mask_of(study, registration, region, labels):
-    """The vertices of a region, as a mask."""
+    """Return the vertices of a region as a mask."""
     n = registration.sizes["vertex"]
     if region is None:
         return np.ones(n, bool)
@@ -115,8 +118,8 @@ def _mask_of(study, registration, region, labels):
             )
         return wanted
     label = _labels_of(study, registration, labels)
-    there = set(label.tolist())
-    lacking = [str(one) for one in wanted.tolist() if one not in there]
+    present = set(label.tolist())
+    lacking = [str(value) for value in wanted.tolist() if value not in present]
     if lacking:
         raise ValueError(
             f"no vertex of the template has the label {listed(lacking)}; it has "
@@ -126,7 +129,7 @@ def _mask_of(study, registration, region, labels):
 
 
 def _labels_of(study, registration, given):
-    """A label for every vertex of a registration: of those given, or of the template."""
+    """Return a label for every vertex of a registration, given or of the template."""
     template = registration.attrs.get("template", "")
     meshes = study["original"].children if "original" in study.children else {}
     if given is None:
@@ -146,12 +149,12 @@ def _labels_of(study, registration, given):
 
 
 def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]) -> xr.DataTree:
-    """The study without a nuisance, such as how far a jaw is open: orthogonal to its regression.
+    """Remove the variation along the regression on a nuisance, such as the opening of a jaw.
 
-    With B the slopes of the displacements on the nuisance (least squares), what lies along B is
-    taken from every displacement.  What is left has no slope on the nuisance, and its modes are
-    orthogonal to B under the vertex areas.  Other variation along B is gone as well; to account for
-    a variable in a test alone, give it as ``covariates``.
+    With B the slopes of the displacements on the nuisance (least squares), the projection on B is
+    subtracted from every displacement.  The residual displacements have no slope on the nuisance,
+    and their modes are orthogonal to B under the vertex areas.  Other variation along B is removed
+    as well; to adjust only a test for a variable, pass it as ``covariates``.
 
     Parameters
     ----------
@@ -161,17 +164,21 @@ def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]
     Returns
     -------
     DataTree
-        ``/registration`` with what is left as ``displacement``, ``/pca``, ``/subjects`` and
+        ``/registration`` with the residuals as ``displacement``, ``/pca``, ``/subjects`` and
         ``/report``.
 
     Raises
     ------
     ValueError
-        When a shape has no value, or the nuisance is constant.
+        If a shape has no value, or the nuisance is constant.
+
+    See Also
+    --------
+    within, with_size : other restrictions of a study.
 
     Examples
     --------
-    With the ``study`` of six small brains; without the first mode:
+    With the ``study`` of six small brains; without the variation along the first mode:
 
     >>> import numpy as np
     >>> import s4a
@@ -196,7 +203,7 @@ def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]
     U, S, _ = np.linalg.svd(standardize(Z)[0], full_matrices=False)
     U = U[:, S > 1e-8]
     if not U.shape[1]:
-        raise ValueError("the nuisance is constant: there is nothing to be without")
+        raise ValueError("the nuisance is constant: there is no variation to remove")
     mean = d.mean(0)
     around = (d - mean).astype(float)
     B = np.einsum("sr,snx->rnx", U, around)  # slopes, up to their scale
@@ -204,21 +211,21 @@ def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]
     keep = root > 1e-12 * root.max()
     basis = np.einsum("rk,rnx->knx", V[:, keep] / np.sqrt(root[keep]), B)
     along = np.einsum("snx,knx,n->sk", around, basis, area, optimize=True)
-    left = mean + around - np.einsum("sk,knx->snx", along, basis)
-    part = _displaced(registration, left.astype(d.dtype))
+    residual = mean + around - np.einsum("sk,knx->snx", along, basis)
+    part = _displaced(registration, residual.astype(d.dtype))
     return _study(study, part)
 
 
 def with_size(study: xr.DataTree) -> xr.DataTree:
     """Return the study with the size restored that the alignment removed.
 
-    Boas coordinates (Bookstein 2021): a shape that x -> s R x + t made as large as the template is
-    divided by its s around the centre of the template.
+    Boas coordinates (Bookstein 2021): a shape that x -> s R x + t scaled to the template's size
+    is divided by its s about the centre of the template.
 
     Parameters
     ----------
     study : DataTree
-        Of :func:`s4a.analyse` with ``remove_size=True``.
+        From :func:`s4a.analyse` with ``remove_size=True``.
 
     Returns
     -------
@@ -228,23 +235,31 @@ def with_size(study: xr.DataTree) -> xr.DataTree:
     Raises
     ------
     ValueError
-        When size was not taken out.
+        If size was not removed.
+
+    See Also
+    --------
+    within, without : other restrictions of a study.
+
+    References
+    ----------
+    F. L. Bookstein (2021), Centric allometry, Evolutionary Biology 48.
 
     Examples
     --------
-    With the ``study`` of six small brains, which kept their sizes:
+    With the ``study`` of six small brains, which includes size:
 
     >>> import s4a
     >>> import s4a_morphometrics
     >>> s4a_morphometrics.with_size(s4a.synthetic.example_study())
     Traceback (most recent call last):
-    ValueError: size was not taken out of these displacements: it is in them (remove_size=False)
+    ValueError: the displacements of this study include size (remove_size=False): nothing to restore
     """
     registration = registration_of(study)
     s = registration["scale"].values
     if abs(s - 1).max() < 1e-9:
         raise ValueError(
-            "size was not taken out of these displacements: it is in them (remove_size=False)"
+            "the displacements of this study include size (remove_size=False): nothing to restore"
         )
     X, T = as_arrays(registration)
     area = vertex_areas(X, T)
@@ -253,16 +268,14 @@ def with_size(study: xr.DataTree) -> xr.DataTree:
     sized = (X + d - center) / s[:, None, None] + center - X
     part = _displaced(registration, sized.astype(d.dtype))
     part["scale"] = registration["scale"].copy(data=np.ones_like(s))
-    if (
-        "translation" in registration
-    ):  # of the transform x -> R x + t' that leaves sizes as they are
+    if "translation" in registration:  # of x -> R x + t', which preserves size
         t = registration["translation"]
         part["translation"] = t.copy(data=(t.values - center) / s[:, None] + center)
     return _study(study, part)
 
 
 def _displaced(registration, d):
-    """A registration with other displacements, and without what else is said of those it had."""
+    """Return a registration with other displacements, without variables derived from the old."""
     others = [str(name) for name in registration if str(name).startswith("displacement_")]
     return registration.drop_vars(others).assign(
         displacement=registration["displacement"].copy(data=d)
@@ -270,7 +283,7 @@ def _displaced(registration, d):
 
 
 def _study(study, registration, vertices=slice(None)):
-    """A study of a registration, with modes of its own, tables and fields of the one it is from."""
+    """Return a study of a registration with new modes, and tables and fields of the original."""
     modes = pca(registration, vertex_areas(*as_arrays(registration)))
     nodes = {"/registration": registration, "/pca": modes}
     for name in ("subjects", "report"):

@@ -1,8 +1,8 @@
-"""Modes as a statistical shape model of Scalismo and statismo, and such models as modes (6.1).
+"""Statistical shape models of Scalismo and statismo (6.1): write modes, read models.
 
 A model is a Gaussian: x = mean + sum_i a_i sqrt(lambda_i) u_i with a_i standard normal and u_i
-orthonormal over the 3 n coordinates.  Modes are orthonormal under the vertex areas, so that they
-are turned among each other: the Gaussian stays, the components are those of equal weights.
+orthonormal over the 3 n coordinates.  Modes of S4A are orthonormal under the vertex areas instead.
+They are rotated when written: the Gaussian is unchanged, its components are those of equal weights.
 """
 
 from pathlib import Path
@@ -33,9 +33,9 @@ def write_scalismo(
     study : DataTree
         With ``/registration`` and ``/pca``.
     folder : path
-        Made where it is missing.
+        Created if missing.
     n_modes : int, optional
-        The first modes alone; all by default.
+        Number of modes, the first ones; all by default.
 
     Returns
     -------
@@ -45,13 +45,22 @@ def write_scalismo(
     Raises
     ------
     ValueError
-        When the study has no modes.
+        If the study has no modes.
+
+    See Also
+    --------
+    read_scalismo : reads the file.
+
+    References
+    ----------
+    M. Luethi, R. Blanc, T. Albrecht et al. (2012), Statismo: a framework for PCA based statistical
+    models, The Insight Journal.
     """
     registration = registration_of(study)
     X, T = as_arrays(registration)
     mean = synthesize(study, np.zeros(1))["position"].values
     modes = study["pca"].to_dataset()
-    D = modes["deformation"].values.astype(float)  # (c, n, 3), each of one deviation
+    D = modes["deformation"].values.astype(float)  # (c, n, 3), for one standard deviation
     if n_modes is not None:
         check_count("n_modes", n_modes, 1)
         D = D[:n_modes]
@@ -68,13 +77,13 @@ def write_scalismo(
         file["model/noiseVariance"] = np.zeros(1, np.float32)
         file["representer/points"] = np.ascontiguousarray(X.T, np.float32)
         file["representer/cells"] = np.ascontiguousarray(T.T, np.int32)
-        words = {
+        attributes = {
             "name": "itkStandardMeshRepresenter",
             "version/majorVersion": "0",
             "version/minorVersion": "9",
             "datasetType": "POLYGON_MESH",
         }
-        for name, value in words.items():
+        for name, value in attributes.items():
             file["representer"].attrs[name] = value
         file["version/majorVersion"], file["version/minorVersion"] = np.int32(0), np.int32(9)
         file["modelinfo/build-time"] = ""
@@ -86,29 +95,32 @@ def write_scalismo(
 
 
 def read_scalismo(path: Path | str) -> xr.DataTree:
-    """A statistical shape model of Scalismo or statismo as modes.
+    """Read a statistical shape model of Scalismo or statismo.
 
     Parameters
     ----------
     path : str or Path
-        HDF5 of a triangle mesh, of the versions 0.8, 0.9 and 1.x.
+        HDF5 file of a triangle mesh model, version 0.8, 0.9 or 1.x.
 
     Returns
     -------
     DataTree
-        ``/registration`` with the reference as template and ``/pca``, as
-        :func:`s4a.synthesize` takes them: ``mean_displacement``, ``deformation``,
-        ``standard_deviation`` (over equal areas of sum 1, as ever) and
+        ``/registration`` with the reference as template, and ``/pca`` with ``mean_displacement``,
+        ``deformation``, ``standard_deviation`` (for areas of sum 1) and
         ``explained_variance_ratio``; its attribute ``noise_variance``.
 
     Raises
     ------
     ValueError
-        When the file is missing or is no such model; the message has the file and what it lacks.
+        If the file is missing or not such a model; the message names the file and the missing part.
+
+    See Also
+    --------
+    s4a.synthesize : synthesises shapes of the model.
 
     Examples
     --------
-    With the ``study`` of six small brains; what was written is read back:
+    With the ``study`` of six small brains; the model is written and read:
 
     >>> import tempfile
     >>> import s4a
@@ -125,8 +137,8 @@ def read_scalismo(path: Path | str) -> xr.DataTree:
         with h5py.File(path, "r") as file:
             mean, basis, variance, X, T = (_array(file, name) for name in MODEL + REPRESENTER)
             noise = _array(file, "model/noiseVariance") if "model/noiseVariance" in file else [0.0]
-            is_scaled = _version(file) == (0, 8)  # columns were of one standard deviation
-    except Exception as error:  # whatever a file holds, the message must name it
+            is_scaled = _version(file) == (0, 8)  # columns have the length of one deviation
+    except Exception as error:  # the message must name the file
         raise ValueError(
             f"{shown(path)} cannot be read as a statistical shape model: "
             f"{shown(error) or type(error).__name__}"
@@ -144,12 +156,12 @@ def read_scalismo(path: Path | str) -> xr.DataTree:
     width = 1.0 if is_scaled else np.sqrt(np.maximum(variance, 0))
     D = (basis.astype(float) * width).T.reshape(-1, n, 3)
     area = vertex_areas(X, T)
-    spread = np.einsum("cnx,n->c", D**2, area / area.sum())
+    variances = np.einsum("cnx,n->c", D**2, area / area.sum())
     modes = dataset(
         mean_displacement=mean.reshape(n, 3) - X,
         deformation=D,
-        standard_deviation=np.sqrt(spread),
-        explained_variance_ratio=spread / spread.sum(),
+        standard_deviation=np.sqrt(variances),
+        explained_variance_ratio=variances / variances.sum(),
     )
     registration = as_dataset(X, T, {"template": "reference"}, vertex_area=area)
     modes.attrs["noise_variance"] = float(np.ravel(noise)[0])
@@ -157,7 +169,7 @@ def read_scalismo(path: Path | str) -> xr.DataTree:
 
 
 def _array(file: h5py.File, name: str) -> Any:
-    """The numbers of a dataset that the file itself has."""
+    """Return the numbers of a dataset stored in the file itself."""
     if file.get(name, getclass=True, getlink=True) is not h5py.HardLink:
         raise ValueError(f"{name} needed, found {', '.join(file) or 'nothing'}")
     stored = file[name]
@@ -172,7 +184,7 @@ def _array(file: h5py.File, name: str) -> Any:
 
 
 def _version(file):
-    """Major and minor version; files without are of the first statismo, whose name tells them."""
+    """Return major and minor version; the first statismo files have only a name."""
     if "version/majorVersion" in file:
         return tuple(int(_array(file, f"version/{part}Version")) for part in ("major", "minor"))
     name = file["representer"].attrs.get("name", "")

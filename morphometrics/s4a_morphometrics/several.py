@@ -1,9 +1,9 @@
-"""Several structures of each subject (5.1, the data): a study of each, in one folder and one tree.
+"""Multi-structure studies (5.1, the data): one study per structure, in one folder and one tree.
 
-A structure, such as the left hippocampus, is a collection of its own: it has a template and
-correspondences of its own, in the folder ``structures/<name>``, and its shapes are called as their
-subjects.  All structures of a subject lie in the frame of its scan, so they are mirrored together.
-What is said of all of them is in :mod:`s4a_morphometrics.poses`.
+Each structure, such as the left hippocampus, has its own template and correspondences in the folder
+``structures/<name>``.  Its shapes are named after their subjects.  All structures of a subject are
+in the frame of its scan, so they are mirrored together.  :mod:`s4a_morphometrics.poses` analyses
+all structures jointly.
 """
 
 import csv
@@ -32,10 +32,10 @@ from s4a_morphometrics.mirrored import find_mirrored, find_mirrored_new
 
 log = logging.getLogger(__name__)
 
-FOLDER = "structures"  # of a study of several, with one of each structure
-NOTES = "structures.json"  # beside it: their names, and what concerns all of them
-COLUMN, SUBJECT = "structure", "subject"  # of a table
-HOW = (
+FOLDER = "structures"  # has one study per structure
+NOTES = "structures.json"  # names of the structures, remarks and mirrored subjects
+COLUMN, SUBJECT = "structure", "subject"  # columns of a table
+EXPECTED = (
     "{subject: {structure: mesh}} needed, or files and table=, with columns 'shape', 'subject' and "
     "'structure', or label volumes and structures="
 )
@@ -43,12 +43,12 @@ Rows = dict[str, dict[str, str]]  # by shape and column
 
 
 class Part(NamedTuple):
-    """What the analysis of one structure is given; its shapes are called as their subjects."""
+    """Input of the analysis of one structure; its shapes are named after their subjects."""
 
     shapes: dict[str, Any]  # meshes or files
-    landmarks: dict[str, Path]  # files, of those that have one
-    rows: Rows  # of the table; none where there is no table
-    label: int | str | None = None  # of label volumes
+    landmarks: dict[str, Path]  # files, for shapes that have one
+    rows: Rows  # of the table; empty without a table
+    label: int | str | None = None  # in label volumes
 
 
 def analyse_structures(
@@ -63,43 +63,48 @@ def analyse_structures(
     n_jobs: int | None = None,
     **others: Any,
 ) -> xr.DataTree:
-    """From several structures of each subject to a study of every structure.
+    """Analyse several structures of each subject: one study per structure.
 
     Parameters
     ----------
     shapes : dict, path or list of paths
-        ``{"subject_1": {"left": mesh, "right": mesh}, ...}``, whose meshes or files lie where they
-        are to each other; or files and a `table`; or label volumes and `structures`.
+        ``{"subject_1": {"left": mesh, "right": mesh}, ...}``, meshes or files, all structures of a
+        subject in one frame; or files and a `table`; or label volumes and `structures`.
     structures : dict, optional
-        The files are label volumes that each hold several structures: the name of each, and its
-        label or labels: ``{"anterior": 1, "posterior": "2,3"}``.
+        For label volumes with several structures each: the name of every structure and its label
+        or labels, ``{"anterior": 1, "posterior": "2,3"}``.
     table : path, optional
-        As of :func:`s4a.analyse`; of files with columns ``structure`` and ``subject``.
+        As in :func:`s4a.analyse`; for files, with columns ``structure`` and ``subject``.
     landmarks : path, optional
-        A folder with one for each structure, with files named as the subjects, such as
-        ``marks/left/subject_1.csv``; or, of files with a table, files named as these.
+        A folder with a folder for each structure, with files named after the subjects, such as
+        ``marks/left/subject_1.csv``; or, for files with a table, files with the same names.
     reflect : str or list of str, optional
-        As of :func:`s4a.analyse`, of subjects.  ``"auto"`` takes all structures of a subject
-        together.  All of them are mirrored, so that they lie relative to each other as before.
+        As in :func:`s4a.analyse`, for subjects.  ``"auto"`` compares all structures of a subject
+        together.  All of them are mirrored, which preserves their relative pose.
     store : path, optional
-        Folder of the study, with one of each structure in ``structures/<name>``.  A run that was
-        killed goes on at the first missing file.
+        Folder of the study, with the study of each structure in ``structures/<name>``.  A run that
+        was killed resumes at the first missing file.
     options, n_jobs, **others
-        As of :func:`s4a.analyse`.
+        As in :func:`s4a.analyse`.
 
     Returns
     -------
     xarray.DataTree
         A study of each structure in ``/structures/<name>``, see :func:`of_structure`; ``/report``
         with ``structure_status(shape, structure)`` and, with `reflect`, ``reflected(shape)`` and
-        ``mean_chirality(shape)``; its ``remarks`` say which subject lacks a structure.
+        ``mean_chirality(shape)``; its ``remarks`` name the subjects that lack a structure.
 
     Raises
     ------
     ValueError
-        As of :func:`s4a.analyse`, with the name of the structure; when there are fewer than two, or
-        fewer than two subjects have one; when some structures of a subject are to be mirrored and
-        others are not.
+        As in :func:`s4a.analyse`, with the name of the structure; if there are fewer than two
+        structures, fewer than two subjects have one, or some structures of a subject are to be
+        mirrored and others are not.
+
+    See Also
+    --------
+    open_structures : opens the folder again.
+    s4a_morphometrics.structures : variation in relative pose and in shape.
 
     Examples
     --------
@@ -109,39 +114,43 @@ def analyse_structures(
     >>> list(study["structures"]), study["structures/left/registration"].sizes["shape"]
     (['left', 'right'], 4)
     """
-    shown = {"table": table, "landmarks": landmarks, "reflect": reflect}
-    given = {name: value for name, value in shown.items() if value is not None}
-    settings = given_options(given | others, options)
+    named = {"table": table, "landmarks": landmarks, "reflect": reflect}
+    others |= {name: value for name, value in named.items() if value is not None}
+    settings = given_options(others, options)
     if settings.label is not None:
         raise ValueError("structures= gives the labels of each structure: leave out label=")
     parts = parts_of(shapes, structures, settings.table, settings.landmarks, settings.pattern)
     remarks = check_parts(parts, marked=settings.landmarks is not None)
     remarks += remarks_on_files(shapes, settings.pattern, volumes=structures is not None)
-    chosen, hand = None, None
+    mirrored, chirality = None, None
     if settings.reflect == AUTO:
         cleaning = {
-            name: settings.of("cleaning") | {"label": of.label} for name, of in parts.items()
+            name: settings.of("cleaning") | {"label": part.label} for name, part in parts.items()
         }
-        hand, chosen, told = find_mirrored({n: (of.shapes, cleaning[n]) for n, of in parts.items()})
-        remarks += told
+        given = {name: (part.shapes, cleaning[name]) for name, part in parts.items()}
+        chirality, mirrored, lines = find_mirrored(given)
+        remarks += lines
     elif settings.reflect is not None:
-        chosen = named_subjects(str(settings.reflect), parts)
+        mirrored = named_subjects(str(settings.reflect), parts)
     for line in remarks:
         log.warning("%s", line)
     with folder_of(store) as folder:
         (folder / FOLDER).mkdir(parents=True, exist_ok=True)
-        notes = {"structures": list(parts), "remarks": remarks, "mirrored": chosen, "hand": hand}
+        notes = {"structures": list(parts), "remarks": remarks}
+        notes |= {"mirrored": mirrored, "chirality": chirality}
         (folder / f"{NOTES}.tmp").write_text(json.dumps(notes))
         (folder / f"{NOTES}.tmp").replace(folder / NOTES)
         studies = {}
         for name, part in parts.items():
             log.info("structure %s", name)
-            own = {"table": None, "landmarks": None, **given_files(part, folder / FOLDER, name)}
-            own |= {"label": part.label, "reflect": mirrored_of(chosen, part)}
-            place = None if store is None else folder / FOLDER / name
+            files = {"table": None, "landmarks": None, **write_inputs(part, folder / FOLDER, name)}
+            files |= {"label": part.label, "reflect": mirrored_in(mirrored, part)}
+            target = None if store is None else folder / FOLDER / name
             try:
-                one = settings.changed(own)
-                studies[name] = s4a.analyse(part.shapes, options=one, store=place, n_jobs=n_jobs)
+                changed = settings.changed(files)
+                studies[name] = s4a.analyse(
+                    part.shapes, options=changed, store=target, n_jobs=n_jobs
+                )
             except ValueError as error:
                 raise ValueError(f"structure {name}: {error}") from error
     return tree_of(studies, notes)
@@ -149,7 +158,7 @@ def analyse_structures(
 
 @contextmanager
 def folder_of(store: Path | str | None) -> Iterator[Path]:
-    """The folder of a study of several structures; a temporary one where it is in memory."""
+    """Yield the folder of a multi-structure study; a temporary one for a study in memory."""
     if store is None:
         with TemporaryDirectory() as temporary:
             yield Path(temporary)
@@ -157,39 +166,39 @@ def folder_of(store: Path | str | None) -> Iterator[Path]:
     folder = Path(store)
     if any(folder.glob("[!.]*")) and not (folder / NOTES).is_file():
         raise ValueError(
-            f"{folder} is no study of several structures and is not empty: give a new or an empty "
+            f"{folder} is not a multi-structure study and is not empty: give a new or an empty "
             "folder"
         )
     yield folder
 
 
-def given_files(part: Part, folder: Path, name: str) -> dict[str, Any]:
-    """The table and the landmarks of one structure, written as :func:`s4a.analyse` takes them."""
-    given: dict[str, Any] = {}
+def write_inputs(part: Part, folder: Path, name: str) -> dict[str, Any]:
+    """Write the table and the landmarks of one structure in the form :func:`s4a.analyse` reads."""
+    inputs: dict[str, Any] = {}
     if part.rows:
-        given["table"] = folder / f"{name}.csv"
-        with given["table"].open("w", newline="", encoding="utf-8") as table:
+        inputs["table"] = folder / f"{name}.csv"
+        with inputs["table"].open("w", newline="", encoding="utf-8") as table:
             columns = list(next(iter(part.rows.values())))
             lines = csv.writer(table)
             lines.writerow(["shape", *columns])
             lines.writerows([shape, *cells.values()] for shape, cells in part.rows.items())
     if part.landmarks:
-        given["landmarks"] = marks = folder / f"{name}.landmarks"
+        inputs["landmarks"] = marks = folder / f"{name}.landmarks"
         shutil.rmtree(marks, ignore_errors=True)
         marks.mkdir(parents=True)
         for subject, file in part.landmarks.items():
             suffix = next(end for end in SUFFIXES if end in file.name.lower())
-            at = file.name.lower().rindex(suffix)  # .gz may follow
-            shutil.copy(file, marks / f"{subject}{file.name[at:]}")
-    return given
+            start = file.name.lower().rindex(suffix)  # .gz may follow
+            shutil.copy(file, marks / f"{subject}{file.name[start:]}")
+    return inputs
 
 
-def mirrored_of(chosen: Iterable[str] | None, part: Part) -> list[str] | None:
-    """Those of the subjects to mirror that have this structure; None where there are none."""
-    return [subject for subject in chosen or () if subject in part.shapes] or None
+def mirrored_in(mirrored: Iterable[str] | None, part: Part) -> list[str] | None:
+    """Return the subjects to mirror that have this structure, or None if there are none."""
+    return [subject for subject in mirrored or () if subject in part.shapes] or None
 
 
-# ---- which shape is whose
+# ---- shapes by structure and subject
 
 
 def parts_of(
@@ -199,48 +208,49 @@ def parts_of(
     landmarks: Path | str | None,
     pattern: str | None = None,
 ) -> dict[str, Part]:
-    """What each structure is given, see :func:`analyse_structures`.
+    """Return the input of each structure, see :func:`analyse_structures`.
 
     Examples
     --------
     >>> from s4a_morphometrics.several import parts_of
     >>> two = {"left": "left.ply", "right": "right.ply"}
-    >>> {name: of.shapes for name, of in parts_of({"a": two}, None, None, None).items()}
+    >>> {name: part.shapes for name, part in parts_of({"a": two}, None, None, None).items()}
     {'left': {'a': 'left.ply'}, 'right': {'a': 'right.ply'}}
     """
     if structures is None and isinstance(shapes, dict) and is_nested(shapes):
         check_names(shapes)
-        names = sorted({str(name) for of in shapes.values() for name in of})
-        given = {
-            name: {one: of[name] for one, of in shapes.items() if name in of} for name in names
+        names = sorted({str(name) for meshes in shapes.values() for name in meshes})
+        shapes_of = {
+            name: {subject: meshes[name] for subject, meshes in shapes.items() if name in meshes}
+            for name in names
         }
         labels: Mapping[str, Any] = {}
     elif structures is not None:
         volumes = shapes_by_name(shapes, pattern, volumes=True)
-        given, labels = dict.fromkeys(map(str, structures), volumes), structures
+        shapes_of, labels = dict.fromkeys(map(str, structures), volumes), structures
     elif table is not None:
         return parts_of_table(shapes_by_name(shapes, pattern), table, landmarks)
     else:
-        raise ValueError(f"several structures of each subject: {HOW}")
-    check_names(given)
-    everyone = sorted({subject for of in given.values() for subject in of})
+        raise ValueError(f"several structures of each subject: {EXPECTED}")
+    check_names(shapes_of)
+    everyone = sorted({subject for meshes in shapes_of.values() for subject in meshes})
     rows = {} if table is None else read_cells(table, everyone)
-    folders = {} if landmarks is None else landmark_folders(landmarks, given)
+    folders = {} if landmarks is None else landmark_folders(landmarks, shapes_of)
     return {
         name: Part(
-            of,
-            files_in(folders.get(name), of),
-            {subject: rows[subject] for subject in of} if rows else {},
+            meshes,
+            files_in(folders.get(name), meshes),
+            {subject: rows[subject] for subject in meshes} if rows else {},
             labels.get(name),
         )
-        for name, of in given.items()
+        for name, meshes in shapes_of.items()
     }
 
 
 def is_nested(shapes: Mapping[str, Any]) -> bool:
-    """Whether a dict of shapes is one of subjects, each a dict of structures."""
-    flat = [str(name) for name, of in shapes.items() if not isinstance(of, dict)]
-    empty = [str(name) for name, of in shapes.items() if isinstance(of, dict) and not of]
+    """Return True for a dict of subjects, each a dict of structures."""
+    flat = [str(name) for name, value in shapes.items() if not isinstance(value, dict)]
+    empty = [str(name) for name, value in shapes.items() if isinstance(value, dict) and not value]
     if flat and len(flat) < len(shapes):
         raise ValueError(
             "every subject needs a dict of its structures, such as {'left': mesh, 'right': mesh}; "
@@ -252,7 +262,7 @@ def is_nested(shapes: Mapping[str, Any]) -> bool:
 
 
 def shapes_by_name(shapes: Any, pattern: str | None, *, volumes: bool = False) -> dict[str, Any]:
-    """Files that were found, or shapes that were given by name."""
+    """Return files or shapes by name."""
     if isinstance(shapes, xr.DataTree):
         return {name: node.to_dataset() for name, node in shapes["original"].children.items()}
     if isinstance(shapes, dict):
@@ -263,18 +273,18 @@ def shapes_by_name(shapes: Any, pattern: str | None, *, volumes: bool = False) -
 def parts_of_table(
     shapes: dict[str, Any], table: Path | str, landmarks: Path | str | None
 ) -> dict[str, Part]:
-    """The shapes by structure, as the columns ``structure`` and ``subject`` of a table say.
+    """Return the input of each structure by the columns ``structure`` and ``subject`` of a table.
 
-    Landmarks are in files named as the shapes, or as the subjects in a folder for each structure.
+    Landmark files are named after the shapes, or after the subjects in a folder per structure.
     """
     rows = read_cells(table, sorted(shapes))
     columns = set().union(*rows.values())
     if not {COLUMN, SUBJECT} <= columns:
         raise ValueError(
-            f"{table}: columns {COLUMN!r} and {SUBJECT!r} needed beside 'shape'; found "
+            f"{table}: columns {COLUMN!r} and {SUBJECT!r} needed in addition to 'shape'; found "
             f"{listed(sorted(columns)) or 'none'}"
         )
-    place: dict[str, dict[str, str]] = {}
+    shape_of: dict[str, dict[str, str]] = {}
     for shape, cells in sorted(rows.items()):
         if is_missing(cells[COLUMN]) or is_missing(cells[SUBJECT]):
             raise ValueError(
@@ -282,7 +292,7 @@ def parts_of_table(
                 f"{cells[COLUMN]!r} and {cells[SUBJECT]!r}"
             )
         structure, subject = slug(cells[COLUMN]), slug(cells[SUBJECT])
-        other = place.setdefault(structure, {}).setdefault(subject, shape)
+        other = shape_of.setdefault(structure, {}).setdefault(subject, shape)
         if other != shape:
             raise ValueError(
                 f"{table}: one shape of each structure of a subject needed; {subject} has two of "
@@ -290,42 +300,43 @@ def parts_of_table(
             )
     flat: dict[str, Path] = {}
     folders: dict[str, Path] = {}
-    if landmarks is not None and any(slug(f.name) in place for f in inner(landmarks)):
-        folders = landmark_folders(landmarks, place)
+    if landmarks is not None and any(slug(f.name) in shape_of for f in subfolders(landmarks)):
+        folders = landmark_folders(landmarks, shape_of)
     elif landmarks is not None:
         flat = files_named(landmarks, shapes, "landmarks", SUFFIXES)
     parts = {}
-    for structure, shape_of in sorted(place.items()):
-        own = dict(sorted(shape_of.items()))
-        marks = files_in(folders.get(structure), own)
-        marks |= {subject: flat[shape] for subject, shape in own.items() if shape in flat}
-        given = {subject: shapes[shape] for subject, shape in own.items()}
-        parts[structure] = Part(given, marks, {one: rows[shape] for one, shape in own.items()})
+    for structure, by_subject in sorted(shape_of.items()):
+        by_subject = dict(sorted(by_subject.items()))
+        marks = files_in(folders.get(structure), by_subject)
+        marks |= {subject: flat[shape] for subject, shape in by_subject.items() if shape in flat}
+        meshes = {subject: shapes[shape] for subject, shape in by_subject.items()}
+        cells_of = {subject: rows[shape] for subject, shape in by_subject.items()}
+        parts[structure] = Part(meshes, marks, cells_of)
     return parts
 
 
 def landmark_folders(landmarks: Path | str, structures: Iterable[str]) -> dict[str, Path]:
-    """The folder of landmarks of every structure that has one, below that of ``landmarks=``.
+    """Return the folder of landmarks of each structure, inside the folder ``landmarks=``.
 
     Raises
     ------
     ValueError
-        When there is none for any, or one that is named as no structure.
+        If there is none, or one without a structure of its name.
     """
     names = list(structures)
-    found = {slug(folder.name): folder for folder in inner(landmarks)}
-    unknown = [repr(folder.name) for name, folder in found.items() if name not in names]
-    if unknown or not found:
+    folders = {slug(folder.name): folder for folder in subfolders(landmarks)}
+    unknown = [repr(folder.name) for name, folder in folders.items() if name not in names]
+    if unknown or not folders:
         raise ValueError(
-            f"landmarks: a folder for each structure ({listed(names)}) needed, with files named as "
-            f"the subjects, such as {shown(landmarks)}/{names[0]}/subject_1.csv; found "
+            f"landmarks: a folder for each structure ({listed(names)}) needed, with files named "
+            f"after the subjects, such as {shown(landmarks)}/{names[0]}/subject_1.csv; found "
             f"{f'a folder {listed(unknown)}' if unknown else 'none'}"
         )
-    return found
+    return folders
 
 
-def inner(landmarks: Path | str) -> list[Path]:
-    """The folders in that of ``landmarks=``; hidden ones are none."""
+def subfolders(landmarks: Path | str) -> list[Path]:
+    """Return the folders inside ``landmarks=``, without hidden ones."""
     folder = Path(landmarks)
     if not folder.is_dir():
         raise ValueError(
@@ -335,64 +346,63 @@ def inner(landmarks: Path | str) -> list[Path]:
 
 
 def files_in(folder: Path | None, names: Iterable[str]) -> dict[str, Path]:
-    """The file of landmarks of each of these subjects that has one."""
+    """Return the landmark file of each subject that has one."""
     try:
         files = {} if folder is None else files_named(folder, names, "landmarks", SUFFIXES)
-    except ValueError:  # of none of them, which check_parts tells
+    except ValueError:  # no subject has one; check_parts reports it
         files = {}
     return {name: files[name] for name in names if name in files}
 
 
 def check_parts(parts: Mapping[str, Part], *, marked: bool, least: int = 2) -> list[str]:
-    """What is missing, in words; ValueError where structures cannot be analysed together."""
+    """Return remarks on missing data; ValueError if the structures cannot be analysed together."""
     if len(parts) < least:
         raise ValueError(f"several structures needed; found {listed(list(parts)) or 'none'}")
     few = [name for name, part in parts.items() if len(part.shapes) < least]
     if few:
         raise ValueError(
             f"every structure needs at least {least} subjects that have it; {few[0]} has "
-            f"{listed(list(parts[few[0]].shapes))} alone"
+            f"only {listed(list(parts[few[0]].shapes))}"
         )
     unmarked = [name for name, part in parts.items() if not part.landmarks]
     remarks = lacking({name: part.shapes for name, part in parts.items()})
     if marked and len(unmarked) == len(parts) and least > 1:
-        raise ValueError("landmarks: no file is named as one of the subjects")
+        raise ValueError("landmarks: no file is named after one of the subjects")
     if marked and unmarked:
-        remarks.append(f"no file of landmarks for any {listed(unmarked)}: registered without")
+        remarks.append(f"no landmark file for any {listed(unmarked)}: registered without landmarks")
     return remarks
 
 
 def lacking(subjects_of: Mapping[str, Iterable[str]]) -> list[str]:
-    """Which subject has none of some structures, in words.
+    """Return a remark for each subject that lacks a structure.
 
     Examples
     --------
     >>> from s4a_morphometrics.several import lacking
     >>> lacking({"left": ["a", "b"], "right": ["a"]})
-    ['b has no right: it is left out of what is said of all structures together']
+    ['b has no right: it is left out of the joint analysis of all structures']
     """
-    have = {name: set(subjects) for name, subjects in subjects_of.items()}
+    having = {name: set(subjects) for name, subjects in subjects_of.items()}
     missing = {
-        subject: [name for name, subjects in have.items() if subject not in subjects]
-        for subject in sorted(set().union(*have.values()))
+        subject: [name for name, subjects in having.items() if subject not in subjects]
+        for subject in sorted(set().union(*having.values()))
     }
     return [
-        f"{subject} has no {listed(names)}: it is left out of what is said of all structures "
-        "together"
+        f"{subject} has no {listed(names)}: it is left out of the joint analysis of all structures"
         for subject, names in missing.items()
         if names
     ]
 
 
 def named_subjects(reflect: str, parts: Mapping[str, Part]) -> list[str]:
-    """The subjects that ``reflect=`` names, all structures of each together.
+    """Return the subjects that ``reflect=`` names, each with all of its structures.
 
     Raises
     ------
     ValueError
-        As of :func:`s4a.input.chirality.to_reflect`; and when structures of one subject have
-        different values in the column, as one that is mirrored without the others would no longer
-        lie where it lay to them.
+        As in :func:`s4a.input.chirality.to_reflect`; and if structures of one subject have
+        different values in the column: mirroring only some of them would change their relative
+        pose.
 
     Examples
     --------
@@ -406,14 +416,14 @@ def named_subjects(reflect: str, parts: Mapping[str, Part]) -> list[str]:
     table: dict[str, list[str]] = {}
     for subject in everyone:
         rows = {name: part.rows[subject] for name, part in parts.items() if subject in part.rows}
-        said = {name: row[column] for name, row in rows.items() if column in row}
-        if len(set(said.values())) > 1:
-            each = [f"{cell!r} ({name})" for name, cell in said.items()]
+        values = {name: row[column] for name, row in rows.items() if column in row}
+        if len(set(values.values())) > 1:
+            cells = [f"{cell!r} ({name})" for name, cell in values.items()]
             raise ValueError(
                 f"reflect={reflect!r}: all structures of a subject are mirrored together, so that "
                 f"their relative pose is kept, and need one value in the column {column!r}; "
-                f"{subject} has {listed(each)}. Structures of both sides as one kind are a study "
-                "of one structure: s4a.analyse, without the column 'structure'"
+                f"{subject} has {listed(cells)}. To pool both sides as one structure, use "
+                "s4a.analyse, without the column 'structure'"
             )
         for name, cell in next(iter(rows.values()), {}).items():
             table.setdefault(name, []).append("" if is_missing(cell) else cell)
@@ -424,17 +434,31 @@ def named_subjects(reflect: str, parts: Mapping[str, Part]) -> list[str]:
 
 
 def open_structures(folder: Path | str) -> xr.DataTree:
-    """A folder of several structures as one tree, see :func:`analyse_structures`.
+    """Open the folder of a multi-structure study as one tree.
+
+    Parameters
+    ----------
+    folder : path
+        The ``store`` of :func:`analyse_structures`.
+
+    Returns
+    -------
+    DataTree
+        As returned by :func:`analyse_structures`.
 
     Raises
     ------
     ValueError
-        When it is no such folder, a folder in it is a link, or one of a structure is missing.
+        If it is not such a folder, a folder in it is a link, or that of a structure is missing.
+
+    See Also
+    --------
+    s4a.open_study : opens a study of one structure.
     """
     folder = Path(folder)
     if not (folder / NOTES).is_file():
         raise ValueError(
-            f"{folder} is no study of several structures: it has no {NOTES}; run "
+            f"{folder} is not a multi-structure study: it has no {NOTES}; run "
             f"`s4a run-structures ... --out {folder}`"
         )
     try:
@@ -444,47 +468,60 @@ def open_structures(folder: Path | str) -> xr.DataTree:
         raise ValueError(f"{folder / NOTES} cannot be read, run again: {error}") from error
     studies = {}
     for name in notes["structures"]:
-        for place in (folder / FOLDER, folder / FOLDER / name):
-            if place.is_symlink():
+        for path in (folder / FOLDER, folder / FOLDER / name):
+            if path.is_symlink():
                 raise ValueError(
-                    f"{place} is a symbolic link, which is not followed within a study: "
-                    "put the folder itself in its place"
+                    f"{path} is a symbolic link, which is not followed within a study: "
+                    "replace it by the folder itself"
                 )
         studies[name] = s4a.open_study(folder / FOLDER / name)
     return tree_of(studies, notes)
 
 
 def tree_of(studies: Mapping[str, xr.DataTree], notes: Mapping[str, Any]) -> xr.DataTree:
-    """The study of every structure, and ``/report`` of all together, as one tree."""
+    """Return the studies of all structures, with a joint ``/report``, as one tree."""
     given: dict[str, Iterable[str]] = notes.get("given", {})
     status = {name: dict.fromkeys(given.get(name, ()), "excluded") for name in notes["structures"]}
     for name, study in studies.items():
         status[name] |= study["report"]["status"].to_series().to_dict()
-    everyone = sorted({subject for of in status.values() for subject in of})
-    table = [[of.get(subject, "missing") for of in status.values()] for subject in everyone]
+    everyone = sorted({subject for by_subject in status.values() for subject in by_subject})
+    table = [[column.get(subject, "missing") for column in status.values()] for subject in everyone]
     report = dataset({"remarks": "\n".join(notes["remarks"])}, structure_status=np.array(table))
     if notes["mirrored"] is not None:
-        report = report.merge(dataset(reflected=[one in notes["mirrored"] for one in everyone]))
-    if notes["hand"] is not None:
-        hand = [notes["hand"].get(subject, np.nan) for subject in everyone]
-        report = report.merge(dataset(mean_chirality=np.array(hand, float)))
+        reflected = [subject in notes["mirrored"] for subject in everyone]
+        report = report.merge(dataset(reflected=reflected))
+    if notes["chirality"] is not None:
+        chirality = [notes["chirality"].get(subject, np.nan) for subject in everyone]
+        report = report.merge(dataset(mean_chirality=np.array(chirality, float)))
     report = report.assign_coords(shape=everyone, structure=list(status))
     nodes = {f"/{FOLDER}/{name}": study for name, study in studies.items()}
     return xr.DataTree.from_dict({"/report": report, **nodes})
 
 
 def structure_names(study: xr.DataTree) -> list[str]:
-    """The structures of a study of several; ValueError where it has none."""
+    """Return the names of the structures; ValueError if the study has none."""
     if FOLDER not in study.children:
         raise ValueError(
-            "a study of several structures needed, as of s4a_morphometrics.analyse_structures; "
+            "a multi-structure study needed, as from s4a_morphometrics.analyse_structures; "
             f"this one has {', '.join(study.children) or 'no nodes'}"
         )
     return list(study[FOLDER].children)
 
 
 def of_structure(study: xr.DataTree, name: str) -> xr.DataTree:
-    """The study of one structure, for all that takes a study.
+    """Return the study of one structure.
+
+    Parameters
+    ----------
+    study : DataTree
+        From :func:`analyse_structures` or :func:`open_structures`.
+    name : str
+        Name of the structure.
+
+    Returns
+    -------
+    DataTree
+        As returned by :func:`s4a.analyse`.
 
     Examples
     --------
@@ -515,32 +552,38 @@ def insert_structures(
     compare: bool = True,
     n_jobs: int | None = None,
 ) -> xr.DataTree:
-    """New subjects in the studies of all structures, which stay as they are.
+    """Register new subjects to the studies of all structures, which stay unchanged.
 
-    A structure of which none can be used is reported, and costs the others nothing.
+    If no new shape of a structure can be used, this is reported and the others are still inserted.
 
     Parameters
     ----------
     study : DataTree
-        Of :func:`analyse_structures` or :func:`open_structures`.
+        From :func:`analyse_structures` or :func:`open_structures`.
     shapes : dict, path or list of paths
-        As of :func:`analyse_structures`; label volumes where the study was made of these.
+        As in :func:`analyse_structures`; label volumes if the study was made from label volumes.
     landmarks, table : path, optional
-        As there.
+        As in :func:`analyse_structures`.
     reflect : str or list of str, optional
-        New subjects to mirror: names, a column of the table, or ``"auto"``, those of the other side
-        than the subjects of the study; all structures of a subject are mirrored together.
+        New subjects to mirror: names, a column of the table, or ``"auto"`` for those of the other
+        side than the subjects of the study; all structures of a subject are mirrored together.
     compare, n_jobs : see :func:`s4a.insert`
 
     Returns
     -------
     DataTree
-        As of :func:`analyse_structures`, with what :func:`s4a.insert` gives for each structure.
+        As returned by :func:`analyse_structures`, with the result of :func:`s4a.insert` for each
+        structure.
 
     Raises
     ------
     ValueError
-        When no new shape can be used, or the study has no such structure.
+        If no new shape can be used, or the study has no such structure.
+
+    See Also
+    --------
+    s4a.insert : the same for one structure.
+    s4a_morphometrics.structures_of_new : poses and shapes of the new subjects.
 
     Examples
     --------
@@ -553,38 +596,38 @@ def insert_structures(
     """
     names = structure_names(study)
     studies = {name: of_structure(study, name) for name in names}
-    labels = {name: Options.from_report(one).label for name, one in studies.items()}
+    labels = {name: Options.from_report(structure).label for name, structure in studies.items()}
     flat = table is None and not (isinstance(shapes, dict) and is_nested(shapes))
     if flat and (None in labels.values() or isinstance(shapes, dict | xr.DataTree)):
-        raise ValueError(f"the study has several structures ({listed(names)}): {HOW}")
+        raise ValueError(f"the study has several structures ({listed(names)}): {EXPECTED}")
     parts = parts_of(shapes, labels if flat else None, table, landmarks)
     unknown = [repr(name) for name in parts if name not in names]
     if unknown:
         raise ValueError(f"the study has no structure {listed(unknown)}; it has {listed(names)}")
     parts = {name: parts.get(name, Part({}, {}, {})) for name in names}
     remarks = check_parts(parts, marked=landmarks is not None, least=0)
-    chosen, told = None, []
+    mirrored, lines = None, []
     if reflect == AUTO:
         given = {name: (studies[name], part.shapes) for name, part in parts.items() if part.shapes}
-        chosen, told = find_mirrored_new(given)
+        mirrored, lines = find_mirrored_new(given)
     elif reflect is not None:
-        chosen = named_subjects(str(Options(reflect=reflect).reflect), parts)
+        mirrored = named_subjects(str(Options(reflect=reflect).reflect), parts)
     inserted, failed = {}, []
     with TemporaryDirectory() as folder:
         for name, part in parts.items():
             if not part.shapes:
                 continue
-            own = given_files(part._replace(rows={}), Path(folder), name)
-            own |= {"reflect": mirrored_of(chosen, part), "compare": compare, "n_jobs": n_jobs}
+            inputs = write_inputs(part._replace(rows={}), Path(folder), name)
+            inputs |= {"reflect": mirrored_in(mirrored, part), "compare": compare, "n_jobs": n_jobs}
             try:
-                inserted[name] = s4a.insert(studies[name], part.shapes, **own)
+                inserted[name] = s4a.insert(studies[name], part.shapes, **inputs)
             except ValueError as error:
                 failed.append(f"structure {name}: {error}")
     if not inserted:
         raise ValueError("; ".join(failed))
-    remarks = [*remarks, *failed, *told]
+    remarks = [*remarks, *failed, *lines]
     for line in remarks:
         log.warning("%s", line)
     given_to = {name: list(part.shapes) for name, part in parts.items()}
-    notes = {"structures": names, "remarks": remarks, "mirrored": chosen, "hand": None}
+    notes = {"structures": names, "remarks": remarks, "mirrored": mirrored, "chirality": None}
     return tree_of(inserted, notes | {"given": given_to})

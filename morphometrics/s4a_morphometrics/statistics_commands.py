@@ -1,4 +1,4 @@
-"""The commands of fields, regions, nuisances and of generalization with new correspondences."""
+"""Commands of fields, regions, nuisances and of generalization with new correspondences."""
 
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,13 +21,13 @@ def fields(
     study : STUDY
         its folder
     folder : FOLDER
-        with a file for each shape: NPY, NPZ, PLY, CSV, GIFTI or FreeSurfer's curv
+        one file per shape: NPY, NPZ, PLY, CSV, GIFTI or FreeSurfer's curv
     name : NAME
-        of the field; also of its array, column or property in the files
+        name of the field, and of its array, column or property in the files
     unit : UNIT
-        of its numbers, such as mm
+        unit of its numbers, such as mm
     partial
-        shapes may lack it; tests leave these out
+        allow shapes without the field; tests leave these shapes out
     """
     import numpy as np
 
@@ -36,11 +36,11 @@ def fields(
     tree = m.with_field(s4a.open_study(study), name, folder, unit=unit, partial=partial)
     path = m.write_field(tree, name, study)
     field = tree["fields"][name].to_dataset()["transferred_field"]
-    known = np.isfinite(field.values)
+    valid = np.isfinite(field.values)
     write(
-        f"{name} of {known.any(1).sum()} of {len(known)} shapes, "
+        f"{name} of {valid.any(1).sum()} of {len(valid)} shapes, "
         f"{np.nanmin(field):.4g} to {np.nanmax(field):.4g} {field.attrs['units']}, mean "
-        f"{np.nanmean(field):.4g}, at {100 * known.mean():.0f} % of the template's vertices: "
+        f"{np.nanmean(field):.4g}, at {100 * valid.mean():.0f} % of the template's vertices: "
         f"{path}",
         f"s4a field-statistics {study} {name} --group COLUMN tests it",
     )
@@ -61,7 +61,7 @@ def field_statistics(
     out: str | None = None,
     seed: int,
 ) -> int:
-    """Test groups and variables of the table on a field in place of shape.
+    """Test groups and variables of the table on a field instead of shape.
 
     Parameters
     ----------
@@ -76,9 +76,9 @@ def field_statistics(
     covariates : COLUMN
         covariates of both
     table : PATH
-        CSV with a column 'shape', in place of the table of the study
+        CSV with a column 'shape', instead of the table of the study
     variances
-        of the fields around what is tested; unequal if groups have different covariance
+        residual variances of the fields; unequal if groups have different covariance
     include_flagged
         include flagged shapes
     permutations : N
@@ -89,7 +89,7 @@ def field_statistics(
     import s4a_morphometrics as m
 
     if not (group or regress_on):
-        raise ValueError("something to test needed: give --group COLUMN or --regress-on COLUMN")
+        raise ValueError("no test chosen: give --group COLUMN or --regress-on COLUMN")
     tree, out = study_to_test(study, out, table, include_flagged)
     n = {} if permutations is None else {"n_permutations": permutations}
     options: dict[str, Any] = {"covariates": covariates, "variances": variances, "seed": seed} | n
@@ -97,14 +97,14 @@ def field_statistics(
     if group:
         results["group"] = m.field_group_test(tree, field, group, **options)
         results["group_map"] = m.field_group_map(tree, field, group, **options)
-        few = {"n_permutations": min(permutations or 99, 99), "seed": seed}  # each trains again
+        few = {"n_permutations": min(permutations or 99, 99), "seed": seed}  # training is slow
         results["classification"] = m.field_classify(tree, field, group, **few)
-        of = f"{field} in groups of {group}"
-        write(tables.significance(results["group"], results["group_map"], of, tree))
+        title = f"{field} in groups of {group}"
+        write(tables.significance(results["group"], results["group_map"], title, tree))
         write(tables.classification_line(results["classification"]), "")
     if regress_on:
-        results["regression"] = found = m.field_regression(tree, field, regress_on, **options)
-        write(tables.significance(found, found, f"{field} on {regress_on}", tree), "")
+        results["regression"] = fit = m.field_regression(tree, field, regress_on, **options)
+        write(tables.significance(fit, fit, f"{field} on {regress_on}", tree), "")
     for name, result in results.items():
         s4a.analysis.export.write_results(result, out, f"{field}_{name}")
     write(f"results: {out}")
@@ -153,9 +153,9 @@ def region_statistics(
     covariates : COLUMN
         covariates of both
     table : PATH
-        CSV with a column 'shape', in place of the table of the study
+        CSV with a column 'shape', instead of the table of the study
     variances
-        of the shapes around what is tested; unequal if groups have different covariance
+        residual variances of the shapes; unequal if groups have different covariance
     include_flagged
         include flagged shapes
     permutations : N
@@ -185,25 +185,25 @@ def restricted(
     """Return the study restricted to a region, without nuisances, or with size restored."""
     import s4a_morphometrics as m
 
-    said = []
+    changes = []
     if restore_size:
         study = m.with_size(study)
-        said.append("with size restored")
+        changes.append("with size restored")
     if regress_out:
         study = m.without(study, regress_out)
-        said.append(f"without {', '.join(regress_out)}")
+        changes.append(f"without {', '.join(regress_out)}")
     if region or min_confidence:
         whole = study["registration"].sizes["vertex"]
-        of = template_labels(study, labels)
-        study = m.within(study, region, labels=of, min_confidence=min_confidence)
-        said.append(f"{study['registration'].sizes['vertex']} of {whole} vertices")
-    if said:
-        write("; ".join(said) + "\n")
+        label = template_labels(study, labels)
+        study = m.within(study, region, labels=label, min_confidence=min_confidence)
+        changes.append(f"{study['registration'].sizes['vertex']} of {whole} vertices")
+    if changes:
+        write("; ".join(changes) + "\n")
     return study
 
 
 def template_labels(study: "xr.DataTree", file: str | None) -> "np.ndarray | None":
-    """Return the labels of the template, from a file with one for each vertex of its file."""
+    """Read the labels of the template from a file with one for each vertex of its mesh file."""
     if file is None:
         return None
     template = s4a.analysis.inputs.all_registered(study).attrs["template"]
@@ -218,7 +218,7 @@ def generalization(
     n_jobs: int,
     seed: int,
 ) -> int:
-    """Compute the generalization of the modes with correspondences found again (slow).
+    """Compute the generalization of the modes with new correspondences (slow).
 
     Parameters
     ----------
@@ -232,15 +232,15 @@ def generalization(
     import s4a_morphometrics as m
 
     tree, out = study_to_test(study, out, None, include_flagged)
-    found = m.generalization(tree, n_jobs=n_jobs, seed=seed)
-    s4a.analysis.export.write_results(found, out, "generalization")
+    result = m.generalization(tree, n_jobs=n_jobs, seed=seed)
+    s4a.analysis.export.write_results(result, out, "generalization")
     names = ("generalization", "generalization_surface")
     rows = [
-        [c + 1, *(tables.measure_cell(found, name, c) for name in names)]
-        for c in range(min(10, found.sizes["component"]))
+        [c + 1, *(tables.measure_cell(result, name, c) for name in names)]
+        for c in range(min(10, result.sizes["component"]))
     ]
     heads = ["components", "between vertices", "to the surface"]
-    write(f"lengths in {found['generalization'].attrs['units']}, ± standard error")
+    write(f"lengths in {result['generalization'].attrs['units']}, ± standard error")
     write(tables.table(rows, heads), f"\nresults: {out}")
     return 0
 

@@ -1,4 +1,4 @@
-"""The commands of several structures: flags, actions and output."""
+"""Commands of multi-structure studies: flags, actions and output."""
 
 from argparse import ArgumentTypeError, Namespace
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from s4a.cli.commands import new_folder, on_cluster, within, write
 from s4a.cli.flags import Command, add_options, whole
 from s4a.options import DECLARED
 
-FOLDERS = "folder of landmark files, with one for each structure, or named as files of the table"
+FOLDERS = "folder with a folder of landmark files per structure, or files named as in the table"
 OPTIONS = [*(name for name in DECLARED if name != "label"), "n_jobs"]
 TABLE = "CSV with columns shape, subject and structure"
 
@@ -25,7 +25,7 @@ def run(args: Namespace) -> int:
         study = analyse_structures(args.paths, store=args.out, structures=given, **options)
     parts = study["structures"].children
     for name, part in parts.items():
-        write(f"structure {name}, a study of its own in {args.out}/structures/{name}")
+        write(f"structure {name}, study in {args.out}/structures/{name}")
         write(run_summary(part))
     write(f"\ns4a structures {args.out} compares them")
     return 1 if any(part["report"].attrs["unforeseen"] for part in parts.values()) else 0
@@ -63,39 +63,41 @@ def compare(args: Namespace) -> int:
     out = Path(args.out) if args.out else within(args.study, "statistics")
     options = {} if args.permutations is None else {"n_permutations": args.permutations}
     inserted = open_inserted(args.new) if args.new else None
-    found = poses.structures(study, scale=args.scale, seed=args.seed, **options)
-    write_results(found, out, "structures")
-    write(structures_tables.structure_lines(found))
+    result = poses.structures(study, remove_size=args.remove_size, seed=args.seed, **options)
+    write_results(result, out, "structures")
+    write(structures_tables.structure_lines(result))
     new = None
     if inserted is not None:
-        new = poses.structures_of_new(found, inserted)
+        new = poses.structures_of_new(result, inserted)
         write_results(new, out, "new_structures")
         write(f"\nnew subjects\n{structures_tables.pose_table(new)}\n")
     for level in poses.LEVELS:
-        if level in found["level"] and not found["level_share"].sel(level=level).any():
-            write(f"{level}: nothing varies")
+        if level in result["level"] and not result["level_share"].sel(level=level).any():
+            write(f"{level}: no variation")
             continue
-        of_level = poses.structures_modes(study, found, level)
-        ratio = of_level["pca"].dataset["explained_variance_ratio"].values[:5]
-        shares = ", ".join(f"{100 * one:.1f}" for one in ratio)
+        level_study = poses.structures_modes(study, result, level)
+        ratio = level_study["pca"].dataset["explained_variance_ratio"].values[:5]
+        shares = ", ".join(f"{100 * share:.1f}" for share in ratio)
         write(f"{level}: modes of {shares} % of its variance")
         if args.group:
-            test = group_test(of_level, args.group, seed=args.seed, **options)
+            test = group_test(level_study, args.group, seed=args.seed, **options)
             write(f"  groups of {args.group}: p = {test['p_value'].item():.3g}")
         if new is not None:
-            scores = poses.structures_modes(study, found, level, new)["pca"].to_dataset()
+            scores = poses.structures_modes(study, result, level, new)["pca"].to_dataset()
             write(structures_tables.new_score_lines(scores))
             write_scores(scores, out / f"new_{level}.csv")
-        write_page(of_level, out / f"{level}.html", title=f"Structures: {level}")
+        write_page(level_study, out / f"{level}.html", title=f"Structures: {level}")
     write(f"\nresults: {out}")
     return 0
 
 
 def named_label(text: str) -> tuple[str, str]:
-    """A structure and its label or labels, as ``left=17``."""
+    """Parse a structure and its label or labels, such as ``left=17``."""
     name, equals, label = text.partition("=")
     if not (name and equals and label):
-        raise ArgumentTypeError(f"a structure and its label needed, as left=17: {text!r}")
+        raise ArgumentTypeError(
+            f"a structure and its label needed, such as left=17: found {text!r}"
+        )
     return name, label
 
 
@@ -105,7 +107,7 @@ def _run(add: Callable[..., Any]) -> None:
     add("-o", "--out", required=True, metavar="FOLDER", help=text)
     text = "dask scheduler tcp://host:port, or local:N worker processes"
     add("--cluster", metavar="ADDRESS", help=text)
-    text = "label volumes that each hold several structures: left=17 right=53"
+    text = "label volumes with several structures each: left=17 right=53"
     add("--structures", nargs="+", type=named_label, metavar="NAME=LABEL", help=text)
     add_options(add, OPTIONS)
 
@@ -124,7 +126,7 @@ def _insert(add: Callable[..., Any]) -> None:
 
 def _compare(add: Callable[..., Any]) -> None:
     add("study", metavar="STUDY")
-    add("--scale", action="store_true", help="remove the size of each whole subject")
+    add("--remove-size", action="store_true", help="remove the size of each whole subject")
     text = "also test groups for differences in relative pose and in shape"
     add("--group", metavar="COLUMN", help=text)
     text = "folder of s4a insert-structures, or its inserted.nc: poses and scores of new subjects"

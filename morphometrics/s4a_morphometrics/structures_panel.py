@@ -1,4 +1,4 @@
-"""Several structures of each subject (6.1): how they lie, their shapes, and both, on sliders."""
+"""Panel of multi-structure studies (6.1): modes of relative poses, of shapes, and of both."""
 
 import ipywidgets
 import numpy as np
@@ -13,7 +13,7 @@ from s4a.widgets.modes import ModesView
 from s4a.widgets.panel import Panel, checkbox, dropdown, row, unbroken_row
 from s4a_morphometrics.poses import LEVELS, structures, structures_modes
 
-WORDS = {
+LABELS = {
     "joint": "poses and shapes",
     "between": "between structures: poses",
     "within": "within structures: shapes",
@@ -23,27 +23,27 @@ N_MODES = 6
 
 
 class Structures(Panel):
-    """Sliders that move and deform all structures of the mean subject, each in a colour of its own.
+    """Sliders that move and deform all structures of the mean subject, coloured by structure.
 
     Parameters
     ----------
     study : xarray.DataTree
-        Of several structures, see :func:`s4a_morphometrics.analyse_structures`.
-    found : xarray.Dataset, optional
-        Of :func:`s4a_morphometrics.structures`, which is computed by default.
+        From :func:`s4a_morphometrics.analyse_structures`.
+    result : xarray.Dataset, optional
+        From :func:`s4a_morphometrics.structures`; computed by default.
     level : {"joint", "between", "within"}
-        Whose modes are on the sliders first: of poses and shapes, of poses, of shapes.
+        Initial level of the sliders: poses and shapes, poses, or shapes.
     n_modes : int
-        How many modes of each level, the first, where there are as many.
+        Largest number of modes of each level.
     view, up
-        From where they are seen first; see :func:`s4a.show.draw.rotation`.
+        Initial direction of view; see :func:`s4a.show.draw.rotation`.
 
     Attributes
     ----------
     views : dict of str to ModesView
-        Of every level that varies.
-    seen, colors : dict of str to widget
-        For each structure whether it is seen, and its colour.
+        One for each level that varies.
+    visible, colors : dict of str to widget
+        Checkbox and colour of each structure.
     """
 
     needs = ("structures",)
@@ -53,88 +53,92 @@ class Structures(Panel):
 
     def build(
         self,
-        found: xr.Dataset | None = None,
+        result: xr.Dataset | None = None,
         level: str = "joint",
         n_modes: int = N_MODES,
     ) -> list:
-        """A list of levels, a box and a colour for each structure, and the sliders."""
-        self.found = structures(self.study) if found is None else found
-        variance = self.found["level_variance"].sum("structure").to_series()
-        varying = [one for one in LEVELS if one == "joint" or variance[one] > 0]
-        names = self.found["structure"].values.tolist()
-        self.seen = {name: checkbox(name, f"whether {name} is seen", on=True) for name in names}
+        """Return the controls of levels and structures, and the sliders."""
+        self.result = structures(self.study) if result is None else result
+        variance = self.result["level_variance"].sum("structure").to_series()
+        varying = [level for level in LEVELS if level == "joint" or variance[level] > 0]
+        names = self.result["structure"].values.tolist()
+        self.visible = {name: checkbox(name, f"show {name}", on=True) for name in names}
         self.colors = {
             name: ipywidgets.ColorPicker(
                 value=COLORS[k % len(COLORS)],
                 concise=True,
-                tooltip=f"the colour of {name}",
+                tooltip=f"colour of {name}",
                 layout={"width": "auto"},
             )
             for k, name in enumerate(names)
         }
-        self.views = {one: self.view_of(one, n_modes) for one in varying}
+        self.views = {name: self.view_of(name, n_modes) for name in varying}
         share = 100 * variance / variance.sum()
         options = [
-            (WORDS[one] + ("" if one == "joint" else f", {share[one]:.0f} % of the variance"), one)
-            for one in varying
+            (LABELS[k] + ("" if k == "joint" else f", {share[k]:.0f} % of the variance"), k)
+            for k in varying
         ]
         self.level = dropdown(
-            "modes", "what the sliders change", options, value=level, layout={"width": "32em"}
+            "modes",
+            "variation that the sliders show",
+            options,
+            value=level,
+            layout={"width": "32em"},
         )
         self.on_change(self.level, self.show_level)
-        self.redraw(self.show_structures, *self.seen.values())
+        self.redraw(self.show_structures, *self.visible.values())
         self.redraw(self.paint, *self.colors.values())
         self.show_level(level)
         self.paint()
-        pairs = [unbroken_row(self.seen[name], self.colors[name]) for name in names]
+        pairs = [unbroken_row(self.visible[name], self.colors[name]) for name in names]
         return [row(self.level, *pairs), *self.views.values()]
 
     def view_of(self, level: str, n_modes: int) -> ModesView:
-        """The sliders of a level."""
-        study = structures_modes(self.study, self.found, level)
+        """Return the sliders of a level."""
+        study = structures_modes(self.study, self.result, level)
         mean, triangles, deformation = mode_arrays(study, None, n_modes)
         return ModesView(
             mean,
             triangles,
             deformation,
             limits=mode_limits(study),
-            unit=unit_of(self.found["position"]),
+            unit=unit_of(self.result["position"]),
             **score_state(study, n_modes),
             **self.camera,
             colors="own",
         )
 
     def show_level(self, level: str) -> None:
-        """Show the sliders of a level, and no others."""
-        for one, view in self.views.items():
-            view.layout.display = None if one == level else "none"
+        """Show the sliders of one level."""
+        for name, view in self.views.items():
+            view.layout.display = None if name == level else "none"
 
-    def visible(self) -> np.ndarray:
-        """The triangles ``(m, 3)`` of the structures that are seen."""
-        triangles = self.found["corner_vertex"].values
-        of = self.found["structure_of_vertex"].values[triangles[:, 0]]
-        seen = np.array([box.value for box in self.seen.values()])
-        return triangles[seen[of]]
+    def visible_triangles(self) -> np.ndarray:
+        """Return the triangles ``(m, 3)`` of the visible structures."""
+        triangles = self.result["corner_vertex"].values
+        structure = self.result["structure_of_vertex"].values[triangles[:, 0]]
+        visible = np.array([box.value for box in self.visible.values()])
+        return triangles[visible[structure]]
 
     def show_structures(self) -> None:
-        """Draw the structures that are seen, on all levels."""
-        triangles = self.visible()
+        """Draw the visible structures, on all levels."""
+        triangles = self.visible_triangles()
         if not len(triangles):
             raise ValueError("tick at least one structure")
         for view in self.views.values():
             view.change_triangles(triangles)
 
     def paint(self) -> None:
-        """Give each structure its colour."""
+        """Colour each structure."""
         colors = np.array([to_rgb(picker.value) for picker in self.colors.values()])
-        own = color_bytes(colors[self.found["structure_of_vertex"].values])
+        rgb = color_bytes(colors[self.result["structure_of_vertex"].values])
         for view in self.views.values():
-            view.own = own
+            view.own = rgb
             view.draw_still()
 
     @property
     def scores(self) -> list[float]:
-        """Of the level that is shown, in standard deviations, one for each mode."""
+        """Scores of the displayed level, in standard deviations, one for each mode."""
         return self.views[self.level.value].scores
 
     @scores.setter
@@ -142,6 +146,6 @@ class Structures(Panel):
         self.views[self.level.value].scores = list(scores)
 
     def vertices(self) -> np.ndarray:
-        """Vertices ``(n, 3)`` of all structures as the sliders stand, in the unit of the input."""
+        """Return the displayed vertices ``(n, 3)`` of all structures, in the unit of the input."""
         mean, _, deformation = self.views[self.level.value].arrays
         return apply_scores(mean, deformation, np.array(self.scores))

@@ -76,10 +76,10 @@ def asymmetry_table(result: xr.Dataset) -> str:
         f"antisymmetry: kurtosis {result['kurtosis'].item():.2f} along the first component, "
         f"p = {p:.3g} for a kurtosis this low of normal individuals"
     )
-    if "gap" in result.attrs:
+    if "involution_error" in result.attrs:
         lines.append(
             f"distance of a vertex and the partner of its partner: "
-            f"{100 * result.attrs['gap']:.2f} % of sqrt(area)"
+            f"{100 * result.attrs['involution_error']:.2f} % of sqrt(area)"
         )
     return "\n".join(lines)
 

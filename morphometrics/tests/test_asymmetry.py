@@ -54,18 +54,20 @@ def study_of(d, mesh=MESH, **subjects):
 
 
 def bump():
-    """A push outward around a place on the right, of height 1 (n, 3), and where it is high."""
+    """An outward bump at a point on the right, of height 1 (n, 3), and the mask of its top."""
     X, T = MESH
     height = np.exp(-((X - [1.7, 1.0, 0.6]) ** 2).sum(1) / 0.5)
     return height[:, None] * vertex_normals(X, T), height > 0.5
 
 
 @pytest.fixture(scope="module")
-def halves():
+def partners():
     """The partners of the vertices of the ellipsoid, as its equation gives them."""
     X, T = MESH
-    (triangle, weights), _, gap = involution(X * M, X, T)
-    return dataset(partner_triangle=triangle, partner_barycentric=weights, partner_distance=gap)
+    (triangle, weights), _, distance = involution(X * M, X, T)
+    return dataset(
+        partner_triangle=triangle, partner_barycentric=weights, partner_distance=distance
+    )
 
 
 def test_the_plane_is_that_between_points_and_their_mirror_images():
@@ -88,24 +90,26 @@ def test_a_map_to_the_other_side_that_errs_becomes_an_involution():
     np.testing.assert_allclose(np.linalg.norm(again - X, axis=1), after, atol=1e-12)
 
 
-def test_the_parts_add_up_and_the_asymmetry_changes_sign_on_the_other_side(halves):
+def test_the_parts_add_up_and_the_asymmetry_changes_sign_on_the_other_side(partners):
     study = study_of(fields(0, 8))
-    found = asymmetry(study, halves=halves, **OPTIONS)
+    found = asymmetry(study, partners=partners, **OPTIONS)
     a, s = found["asymmetry"].values, found["symmetric"].values
     mean = found["symmetric_position"].values
     X, T = MESH
-    place = halves["partner_triangle"].values, halves["partner_barycentric"].values
+    place = partners["partner_triangle"].values, partners["partner_barycentric"].values
     plane = plane_between(mean, interpolate(mean, T, *place), vertex_areas(X, T))
-    turned = plane.turned(a)
+    reflected = plane.reflected(a)
     there = np.stack([interpolate(one, T, *place) for one in a.astype(float)])
-    assert np.sqrt(((there + turned) ** 2).mean()) < 0.1 * np.sqrt((a**2).mean())
+    assert np.sqrt(((there + reflected) ** 2).mean()) < 0.1 * np.sqrt((a**2).mean())
     symmetric = np.stack([interpolate(mean + one, T, *place) for one in s])
     np.testing.assert_allclose(symmetric, plane(mean + s), atol=0.05)
     # each shape is the consensus, its symmetric part and its asymmetry, moved
     shape = X + study["registration"]["displacement"].values[3]
-    gap = np.linalg.norm(shape[:, None, :] - shape[None], axis=-1)
+    distance = np.linalg.norm(shape[:, None, :] - shape[None], axis=-1)
     ours = mean + s[3] + a[3]
-    np.testing.assert_allclose(np.linalg.norm(ours[:, None, :] - ours, axis=-1), gap, atol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(ours[:, None, :] - ours, axis=-1), distance, atol=1e-5
+    )
     # the table: sums of squares over both sides
     area = vertex_areas(X, T) / vertex_areas(X, T).sum()
     total = sum(((s + sign * a) ** 2).sum(-1).sum(0) @ area for sign in (1, -1))
@@ -114,13 +118,13 @@ def test_the_parts_add_up_and_the_asymmetry_changes_sign_on_the_other_side(halve
     assert found.attrs["symmetry"] == "object"
 
 
-def test_directional_asymmetry_is_found_where_it_is_and_on_the_other_side(halves):
+def test_directional_asymmetry_is_found_where_it_is_and_on_the_other_side(partners):
     push, patch = bump()
     study = study_of(fields(1, 14) + 0.4 * push)
-    found = asymmetry(study, halves=halves, **OPTIONS)
+    found = asymmetry(study, partners=partners, **OPTIONS)
     assert found["p_value"].item() == 0.005
     T = MESH[1]
-    place = halves["partner_triangle"].values, halves["partner_barycentric"].values
+    place = partners["partner_triangle"].values, partners["partner_barycentric"].values
     there = interpolate(patch[:, None].astype(float), T, *place)[:, 0] > 0.5
     marked = found["p_family_wise"].values <= 0.05
     assert marked[patch | there].mean() > 0.8
@@ -132,44 +136,46 @@ def test_directional_asymmetry_is_found_where_it_is_and_on_the_other_side(halves
     assert outward[there].mean() == pytest.approx(-0.15, abs=0.06)
     assert found["effect_size"].values[patch].mean() > 1
     assert found["antisymmetry_p"] > 0.05
-    vectors = asymmetry(study, halves=halves, of="vector", **OPTIONS)
+    vectors = asymmetry(study, partners=partners, of="vector", **OPTIONS)
     assert (vectors["p_family_wise"].values[patch] <= 0.05).mean() > 0.5
 
 
-def test_without_it_nothing_is_found(halves):
+def test_without_it_nothing_is_found(partners):
     p = []
     for seed in range(12):
-        found = asymmetry(study_of(fields(10 + seed, 10)), halves=halves, n_permutations=99)
+        found = asymmetry(study_of(fields(10 + seed, 10)), partners=partners, n_permutations=99)
         p.append([found["p_value"].item(), found["p_family_wise"].min().item()])
     assert (np.array(p) <= 0.05).mean(0).max() <= 0.25
     assert np.median(p) > 0.2
 
 
-def test_an_error_of_the_partners_along_the_surface_is_no_asymmetry_along_the_normals(halves):
+def test_an_error_of_the_partners_along_the_surface_is_no_asymmetry_along_the_normals(partners):
     X, T = MESH
     rng = np.random.default_rng(1)
-    place, _, gap = involution(X * M + 0.5 * smooth(rng, X, 1)[0], X, T)
-    wrong = dataset(partner_triangle=place[0], partner_barycentric=place[1], partner_distance=gap)
+    place, _, distance = involution(X * M + 0.5 * smooth(rng, X, 1)[0], X, T)
+    wrong = dataset(
+        partner_triangle=place[0], partner_barycentric=place[1], partner_distance=distance
+    )
     study = study_of(fields(30, 12))
     of = {}
     for kind in ("vector", "normal"):
-        found = asymmetry(study, halves=wrong, of=kind, **OPTIONS)
+        found = asymmetry(study, partners=wrong, of=kind, **OPTIONS)
         of[kind] = (found["p_family_wise"].values <= 0.05).mean()
     assert of["vector"] > 0.2
     assert of["normal"] < 0.05
 
 
-def test_antisymmetry_is_told_from_directional_asymmetry(halves):
+def test_antisymmetry_is_distinguished_from_directional_asymmetry(partners):
     push, _ = bump()
     sign = np.where(np.arange(16) % 2, 1.0, -1.0)
     d = fields(2, 16) + 0.8 * sign[:, None, None] * push
-    found = asymmetry(study_of(d), halves=halves, **OPTIONS)
+    found = asymmetry(study_of(d), partners=partners, **OPTIONS)
     assert found["antisymmetry_p"] < 0.02
     assert found["kurtosis"] < 1.6
     assert found["p_value"] > 0.05
     assert abs(np.corrcoef(found["asymmetry_score"].values[:, 0], sign)[0, 1]) > 0.9
-    larger = asymmetry(study_of(fields(2, 16, fluctuating=0.1)), halves=halves, **OPTIONS)
-    smaller = asymmetry(study_of(fields(2, 16)), halves=halves, **OPTIONS)
+    larger = asymmetry(study_of(fields(2, 16, fluctuating=0.1)), partners=partners, **OPTIONS)
+    smaller = asymmetry(study_of(fields(2, 16)), partners=partners, **OPTIONS)
     ratio = larger["fluctuating_size"] / smaller["fluctuating_size"]
     assert ratio.values == pytest.approx(2, abs=0.15)
 
@@ -178,7 +184,7 @@ def test_antisymmetry_is_told_from_directional_asymmetry(halves):
 
 
 def matching(d_left, d_right, **columns):
-    """A study of the left and right shapes of subjects, of one hand."""
+    """A study of left and right shapes of subjects, one side mirrored."""
     n = len(d_left)
     columns = {
         "subject": [f"p{i}" for i in range(n)] * 2,
@@ -192,7 +198,7 @@ def test_both_sides_of_subjects_are_compared_and_the_larger_side_is_found():
     d, own = fields(3, 9), fields(4, 18, symmetric=0.02)
     study = matching(d + own[:9], d + own[9:] + 0.6 * push)
     found = asymmetry(study, subject="subject", side="side", **OPTIONS)
-    assert found.attrs["sides"] == "right less left"
+    assert found.attrs["sides"] == "right minus left"
     assert found["individual"].values.tolist() == [f"p{i}" for i in range(9)]
     assert found["p_value"] <= 0.03
     assert (found["p_family_wise"].values[patch] <= 0.05).mean() > 0.8
@@ -205,10 +211,10 @@ def test_both_sides_of_subjects_are_compared_and_the_larger_side_is_found():
     assert p > 0.05
 
 
-def test_what_triangles_and_partners_leave_is_no_asymmetry_of_the_whole_shape(halves):
+def test_errors_of_triangles_and_partners_are_not_asymmetry(partners):
     shapes = fields(3, 16, symmetric=0.1, fluctuating=0.002)  # less than the triangles leave
     for of in ("normal", "vector"):
-        found = asymmetry(study_of(shapes), halves=halves, of=of, **OPTIONS)
+        found = asymmetry(study_of(shapes), partners=partners, of=of, **OPTIONS)
         assert found["p_value"] > 0.05
         assert found["p_family_wise"].min() > 0.05
     a = found["asymmetry"].values.astype(float)
@@ -248,7 +254,7 @@ def test_the_table_is_that_of_two_way_analysis_of_variance():
         ),
         (
             {"subject": [f"p{i}" for i in range(9)] + ["p0", "p1", "p2"]},
-            "at least 4 subjects with both sides, found 3; one side lacks beside",
+            "at least 4 subjects with both sides, found 3; the other side is missing for",
         ),
     ],
 )
@@ -258,14 +264,16 @@ def test_sides_that_are_no_pairs_are_errors_that_name_the_shapes(columns, words)
         asymmetry(matching(d[:6], d[6:], **columns), subject="subject", side="side")
 
 
-def test_a_subject_with_one_side_is_left_out_by_name_and_hands_are_looked_at(caplog):
+def test_a_subject_with_one_side_is_left_out_by_name_and_sides_are_checked(caplog):
     d = fields(6, 12)
     study = matching(
         d[:6], d[6:], subject=[*(f"p{i}" for i in range(6))] + ["p0", "p1", "p2", "p3", "p4", "q"]
     )
     found = asymmetry(study, subject="subject", side="side", **OPTIONS)
     assert found.sizes["individual"] == 5
-    assert "left out, as the other side of their subject lacks: shape_05, shape_11" in caplog.text
+    assert (
+        "left out, because the other side of the subject is missing: shape_05, shape" in caplog.text
+    )
     assert "the run mirrored none of the shapes" in caplog.text
     caplog.clear()
     names = study["registration"]["shape"].values
@@ -275,7 +283,7 @@ def test_a_subject_with_one_side_is_left_out_by_name_and_hands_are_looked_at(cap
     assert "the run mirrored" not in caplog.text
 
 
-def test_what_cannot_be_tested_is_an_error(halves):
+def test_untestable_studies_are_errors(partners):
     study = study_of(fields(7, 6))
     with pytest.raises(ValueError, match="both subject and side"):
         asymmetry(study, subject="subject")
@@ -325,10 +333,10 @@ def test_p_values_of_a_mean_of_zero_are_uniform():
     assert 0.03 < np.mean([(p <= 0.05).mean() for _, p, _ in found]) < 0.07
 
 
-@pytest.mark.parametrize("spread", [[1, 1, 1, 1, 1, 1], [9, 2, 1, 1, 1, 1], [1]])
-def test_p_of_antisymmetry_is_uniform_for_normal_individuals_of_any_covariance(spread):
-    rng = np.random.default_rng(len(spread))
-    drawn = rng.normal(size=(400, 15, len(spread))) * spread
+@pytest.mark.parametrize("deviations", [[1, 1, 1, 1, 1, 1], [9, 2, 1, 1, 1, 1], [1]])
+def test_p_of_antisymmetry_is_uniform_for_normal_individuals_of_any_covariance(deviations):
+    rng = np.random.default_rng(len(deviations))
+    drawn = rng.normal(size=(400, 15, len(deviations))) * deviations
     found = [antisymmetry_test(individuals)[1] for individuals in drawn]
     assert stats.kstest(found, "uniform").pvalue > 0.01
 
@@ -337,56 +345,56 @@ def test_p_of_antisymmetry_is_uniform_for_normal_individuals_of_any_covariance(s
 
 
 def test_the_template_of_a_study_finds_its_other_side(study):
-    halves = symmetry(study)
-    assert halves.attrs["gap"] < min(0.03, halves.attrs["gap_before"])
+    partners = symmetry(study)
+    assert partners.attrs["involution_error"] < min(0.03, partners.attrs["involution_error_before"])
     mesh = study["registration"].to_dataset()
     X, T = as_arrays(mesh)
-    place = halves["partner_triangle"].values, halves["partner_barycentric"].values
+    place = partners["partner_triangle"].values, partners["partner_barycentric"].values
     there = interpolate(X, T, *place)
     plane = plane_between(X, there, vertex_areas(X, T))
     assert abs(plane.normal[0]) > 0.98  # brains are nearly symmetric in x
-    gap = np.linalg.norm(plane(X) - there, axis=1)
-    assert np.median(gap) < 0.1 * np.sqrt(vertex_areas(X, T).sum())
+    distance = np.linalg.norm(plane(X) - there, axis=1)
+    assert np.median(distance) < 0.1 * np.sqrt(vertex_areas(X, T).sum())
 
 
-def test_a_symmetric_template_has_half_of_a_bump_on_each_side(halves):
+def test_a_symmetric_template_has_half_of_a_bump_on_each_side(partners):
     push, high = bump()
     X, T = MESH
     study = study_of(fields(3, 5), (X + 0.2 * push, T))
-    mesh = symmetric_template(study, halves)
+    mesh = symmetric_template(study, partners)
     S = mesh["position"].values
     assert (mesh["corner_vertex"].values == T).all()
-    place = halves["partner_triangle"].values, halves["partner_barycentric"].values
-    gaps = []
+    place = partners["partner_triangle"].values, partners["partner_barycentric"].values
+    distances = []
     for P in (study["registration"]["position"].values, S):  # how far from its mirror image
         there = interpolate(P, T, *place)
         plane = plane_between(P, there, vertex_areas(P, T))
         assert abs(plane.normal[0]) > 0.99
-        gaps.append(np.linalg.norm(plane(there) - P, axis=1))
-    assert gaps[1].max() < 0.15 * gaps[0].max()
+        distances.append(np.linalg.norm(plane(there) - P, axis=1))
+    assert distances[1].max() < 0.15 * distances[0].max()
     moved = ((S - X) * vertex_normals(X, T)).sum(1)
     opposite = np.exp(-((X * M - [1.7, 1.0, 0.6]) ** 2).sum(1) / 0.5) > 0.5
     for side in (high, opposite):
         whole = 0.2 * np.linalg.norm(push, axis=1)[high].mean()
         assert moved[side].mean() == pytest.approx(whole / 2, rel=0.3)
     again = study_of(fields(3, 5), (S, T))
-    assert symmetric_template(again, halves).attrs["moved"] < 0.4 * mesh.attrs["moved"]
+    assert symmetric_template(again, partners).attrs["moved"] < 0.4 * mesh.attrs["moved"]
 
 
-def test_a_template_without_another_side_is_told(caplog):
+def test_a_template_without_bilateral_symmetry_is_reported(caplog):
     mesh = clean(as_dataset(*faulty.shape(400)))
     d = np.random.default_rng(0).normal(size=(5, mesh.sizes["vertex"], 3))
     X, T = as_arrays(mesh)
     with caplog.at_level(logging.WARNING):
         symmetry(study_of(d, (X * [1, 1 + X[:, :1].max() / 50, 1], T)))
-    assert "is it symmetric? Of left and right shapes give subject and side" in caplog.text
+    assert "is the template symmetric? For left and right shapes, give" in caplog.text
 
 
-def test_modes_play_the_directional_part_first_and_have_its_share(halves):
+def test_modes_play_the_directional_part_first_and_have_its_share(partners):
     push, _ = bump()
     study = study_of(fields(8, 8) + 0.2 * push)
     study["registration/displacement"].attrs["units"] = "mm"
-    found = asymmetry(study, halves=halves, **OPTIONS)
+    found = asymmetry(study, partners=partners, **OPTIONS)
     modes = asymmetry_modes(study, found)
     assert unit_text(modes, "") == "mm"
     share = found["variance_share"].values
@@ -412,7 +420,7 @@ def test_the_command_writes_tables_and_a_page(study_folder, tmp_path, capsys):
     with open_study(study_folder) as study:
         template = study["registration"].to_dataset()
         assert (template["corner_vertex"].values == T).all()
-        gap = np.linalg.norm(template["position"].values - X, axis=1)
-    assert 0 < gap.mean() < 5  # mm
+        distance = np.linalg.norm(template["position"].values - X, axis=1)
+    assert 0 < distance.mean() < 5  # mm
     assert cli.main([*command, "--subject", "person"]) == 2
     assert "both subject and side" in capsys.readouterr().err

@@ -42,6 +42,6 @@ def test_a_study_with_a_result_has_a_tab_of_it_and_one_without_has_none(study, f
     tabs.close()
 
 
-def test_without_a_result_the_panel_says_what_it_needs(study):
+def test_without_a_result_the_panel_names_the_missing_node(study):
     with pytest.raises(ValueError, match="needs asymmetry/directional"):
         s4a.widgets.Asymmetry(study)

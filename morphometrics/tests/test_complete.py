@@ -40,7 +40,7 @@ def brain(tree):
 
 @pytest.fixture(scope="module")
 def part(brain):
-    """Its rear 30 % are missing, and it is turned."""
+    """A brain without its rear 30 %, rotated."""
     X, T = as_arrays(brain)
     X, T = cut(X, T, X[:, 1] > np.quantile(X[:, 1], 0.3))
     return X @ TURN.T + [5.0, 0, 0], T
@@ -58,7 +58,7 @@ def truth_of(tree, study):
     return synthetic.position(tree["truth"], "brain_08", u)
 
 
-def test_what_is_known_of_a_normal_vector_gives_the_rest_as_the_formula_says():
+def test_conditioning_a_normal_vector_follows_the_formula():
     rng = np.random.default_rng(0)
     s, n, K = 6, 40, 4
     fields = rng.normal(size=(s, n, 3))
@@ -86,7 +86,7 @@ def test_what_is_known_of_a_normal_vector_gives_the_rest_as_the_formula_says():
     assert mine == pytest.approx(covariance, abs=1e-4 * abs(mine).max())
 
 
-def test_new_shapes_are_told_as_well_as_those_left_out():
+def test_new_shapes_are_predicted_as_well_as_left_out_shapes():
     rng = np.random.default_rng(1)
     mesh = synthetic.ellipsoid(300)
     X, T = as_arrays(mesh)
@@ -110,7 +110,7 @@ def test_new_shapes_are_told_as_well_as_those_left_out():
     assert np.sqrt(np.square(errors).mean()) == pytest.approx(left_out, rel=0.3)
 
 
-def test_intervals_hold_nine_tenths_of_what_the_whole_shape_has(study, brain, found):
+def test_intervals_of_ninety_percent_cover_the_complete_shape(study, brain, found):
     whole = insert(study, {"brain_08": brain}, compare=False)["registration"].to_dataset()
     whole = whole.isel(shape=0)
     image = whole["position"].values + whole["displacement"].values - whole["translation"].values
@@ -134,7 +134,7 @@ def test_intervals_hold_nine_tenths_of_the_truth(tree, study, found):
 
 
 def slid(study, names):
-    """The study with the template turned by eleven degrees on some of its shapes, and how far."""
+    """The study with the match rotated by eleven degrees on some shapes, and the error."""
     X = study["registration"]["position"].values
     slide = np.cross([0, 0, 0.2], X - X.mean(0))
     wrong = study.copy(deep=True)
@@ -143,7 +143,7 @@ def slid(study, names):
     return wrong, deviation_of([abs(slide).ravel()]) / model_of(study).template.frame[1]
 
 
-def test_what_a_match_has_wrong_on_its_own_is_seen_by_going_round_it(study):
+def test_an_error_of_one_match_is_measured_by_the_other_path(study):
     names = study["registration"]["shape"].values.tolist()
     others = [name for name in names if name != study["registration"].attrs["template"]]
     right = between_paths(path_differences(model_of(study)))
@@ -154,20 +154,18 @@ def test_what_a_match_has_wrong_on_its_own_is_seen_by_going_round_it(study):
     assert between_paths(path_differences(model_of(alike))) < 0.4 * turned
 
 
-def test_a_shape_that_is_excluded_from_the_network_is_registered_onto_no_other(study):
+def test_a_shape_excluded_from_the_network_is_not_registered_to_others(study):
     latent = study["latent"].to_dataset()
     name = next(iter(path_differences(model_of(study))))
     without = study.copy()
     without["latent"] = xr.DataTree(latent.sel(shape=latent["shape"] != name))
-    gaps = path_differences(model_of(without))
-    assert name not in gaps
-    assert len(gaps) == 5  # of seven shapes, the template is one
+    distances = path_differences(model_of(without))
+    assert name not in distances
+    assert len(distances) == 5  # of seven shapes, the template is one
 
 
 @pytest.mark.parametrize("n_beside", [0, 1])
-def test_with_fewer_than_two_shapes_beside_the_template_nothing_is_registered_and_that_is_told(
-    study, n_beside, found
-):
+def test_fewer_than_two_shapes_besides_the_template_are_reported(study, n_beside, found):
     template = study["registration"].attrs["template"]
     latent = study["latent"].to_dataset()
     others = [name for name in latent["shape"].values if name != template]
@@ -180,7 +178,7 @@ def test_with_fewer_than_two_shapes_beside_the_template_nothing_is_registered_an
     assert not any("too narrow" in line for line in warnings_of(found))
 
 
-def test_the_missing_area_is_found_and_the_rest_lies_as_well_as_of_the_whole(
+def test_the_missing_region_is_detected_and_the_present_one_as_accurate_as_of_the_whole(
     tree, study, brain, found
 ):
     true = truth_of(tree, study)
@@ -205,11 +203,11 @@ def test_deviations_are_larger_where_nothing_is_and_samples_scatter_by_them(foun
     assert (normal <= np.linalg.norm(sd, axis=1) * (1 + 1e-5)).all()
     drawn = found["sample_position"].values
     assert drawn.std(0)[~there].mean() == pytest.approx(sd[~there].mean(), rel=0.2)
-    gap = (drawn.mean(0) - found["position"].values)[~there]
-    assert abs(gap).mean() < 0.3 * sd[~there].mean()
+    distance = (drawn.mean(0) - found["position"].values)[~there]
+    assert abs(distance).mean() < 0.3 * sd[~there].mean()
 
 
-def test_what_comes_out_is_of_the_study_and_does_not_depend_on_chance(study, part, found):
+def test_the_result_has_the_template_and_does_not_depend_on_the_seed(study, part, found):
     again = complete(study, part, n_samples=200)
     xr.testing.assert_identical(again, found)
     X = study["registration"]["position"].values + found["displacement"].values
@@ -217,7 +215,7 @@ def test_what_comes_out_is_of_the_study_and_does_not_depend_on_chance(study, par
     assert back == pytest.approx(found["position"].values, abs=1e-3)
     covariance = found["score_covariance"].values
     assert np.linalg.eigvalsh(covariance).min() > 0
-    assert np.diag(covariance).max() < 1.05  # the part says something of every mode
+    assert np.diag(covariance).max() < 1.05  # the part has information on every mode
 
 
 def test_a_whole_shape_lacks_nothing(study, brain):
@@ -226,7 +224,7 @@ def test_a_whole_shape_lacks_nothing(study, brain):
     assert found.sizes["sample"] == 0
 
 
-def test_landmarks_say_how_a_part_lies(tree, brain, part, tmp_path):
+def test_landmarks_determine_the_pose_of_a_part(tree, brain, part, tmp_path):
     names = sorted(tree["original"].children)[:5]
     marked = {
         name: with_landmarks(mesh, mesh[["landmark_name", "landmark_position"]])
@@ -253,7 +251,7 @@ def test_landmarks_say_how_a_part_lies(tree, brain, part, tmp_path):
     assert found.attrs["missing"] == pytest.approx(0.3, abs=0.1)
 
 
-def test_what_cannot_be_completed_is_refused_with_the_reason(study, brain, tmp_path):
+def test_invalid_parts_are_refused_with_the_reason(study, brain, tmp_path):
     X, T = as_arrays(brain)
     small = cut(X, T, X[:, 1] > np.quantile(X[:, 1], 0.93))
     with pytest.raises(ValueError, match=r"at least 15 % of the template's area; found"):

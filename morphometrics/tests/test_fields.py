@@ -42,8 +42,8 @@ def test_a_field_of_the_coordinates_is_carried_to_where_the_template_was_registe
     own = mesh.sel(shape=name)
     placed = mesh["position"].values + own["displacement"].values
     expected = ((placed - own["translation"].values) @ own["rotation"].values)[:, 2]
-    gap = abs(field.sel(shape=name).values - expected)
-    assert np.median(gap) < 0.02 * np.ptp(expected)
+    distance = abs(field.sel(shape=name).values - expected)
+    assert np.median(distance) < 0.02 * np.ptp(expected)
     assert "fields" not in study.children
 
 
@@ -120,7 +120,7 @@ def test_a_field_that_does_not_fit_is_refused_by_shape(study, caplog):
         with_field(study, "f", good | {second: np.r_[np.inf, good[second][1:]]})
     with pytest.raises(ValueError, match=f"of {second} is NaN everywhere"):
         with_field(study, "f", good | {second: good[second] * np.nan})
-    with pytest.raises(ValueError, match="values for nobody, which are no shapes"):
+    with pytest.raises(ValueError, match="values for nobody, which are not shapes"):
         with_field(study, "f", good | {"nobody": good[first]})
     with pytest.raises(ValueError, match="one array for each of 4 shapes, found 2"):
         with_field(study, "f", [good[first], good[second]])
@@ -140,7 +140,7 @@ def test_a_field_that_does_not_fit_is_refused_by_shape(study, caplog):
         write_field(found, "g", "nowhere")
 
 
-def test_groups_that_differ_in_a_field_are_told_where_they_do(simulated):
+def test_a_group_difference_in_a_field_is_located(simulated):
     options = {"covariates": ["age", "score"], "n_permutations": 199}
     where = field_group_map(simulated, "thickness", "group", **options)
     assert where["field_effect"].attrs["units"] == "mm"
@@ -165,20 +165,20 @@ def test_the_slope_of_a_field_is_that_of_least_squares(simulated):
     assert np.allclose(fit["field_effect"], slope)
     assert (fit["p_false_discovery"].values[~TOP] < 0.05).mean() > 0.9
     for refused in (statistics.predict, statistics.regression_modes):
-        with pytest.raises(ValueError, match="a field moves no vertex"):
+        with pytest.raises(ValueError, match="a regression of displacements is needed"):
             refused(simulated, fit, *([1.0] if refused is statistics.predict else []))
-    with pytest.raises(ValueError, match="a field has no part along the normals"):
+    with pytest.raises(ValueError, match="a field has no normal component"):
         growth(simulated, "age", "group", field="thickness", of="normal")
 
 
-def test_vertices_and_shapes_without_a_field_are_left_out_and_told(simulated, caplog):
+def test_vertices_and_shapes_without_a_field_are_left_out_and_reported(simulated, caplog):
     caplog.set_level(logging.WARNING)
     values = simulated["fields/thickness/transferred_field"].values.copy()
     values[3, :5] = np.nan
     values[7] = np.nan
     holed = with_carried(simulated, values)
     where = field_group_map(holed, "thickness", "group", n_permutations=99)
-    assert "lacks in some shape at 5 of" in caplog.text
+    assert "is missing in some shape at 5 of" in caplog.text
     assert "field 'thickness' has no value for 1 of 20 shapes" in caplog.text
     assert where.attrs["left_out"] == "shape_07"
     assert np.isnan(where["p_family_wise"].values[:5]).all()
@@ -186,7 +186,7 @@ def test_vertices_and_shapes_without_a_field_are_left_out_and_told(simulated, ca
     with pytest.raises(ValueError, match=r"no field 'curv'; it has thickness"):
         field_group_map(simulated, "curv", "group")
     same = with_carried(simulated, np.ones_like(values))
-    with pytest.raises(ValueError, match="the same in all shapes: there is nothing to test"):
+    with pytest.raises(ValueError, match="the same in all shapes: no variation to test"):
         field_group_map(same, "thickness", "group")
 
 

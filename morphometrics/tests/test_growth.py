@@ -87,7 +87,7 @@ def test_a_covariate_that_changes_nothing_changes_no_statistic(simulated):
     assert np.allclose([fit["statistic"] for fit in fits], fits[0]["statistic"])
 
 
-def test_a_simulated_growth_is_found_where_it_is_with_its_slope(simulated):
+def test_a_planted_growth_is_found_where_it_is_with_its_slope(simulated):
     fit = growth(simulated, "age", "person", n_permutations=199)
     assert np.allclose(fit["effect"].values[TOP, 0].mean(), 0.05, rtol=0.15)
     assert abs(fit["effect"].values[~TOP]).mean() < 0.01
@@ -98,8 +98,8 @@ def test_a_simulated_growth_is_found_where_it_is_with_its_slope(simulated):
     assert np.corrcoef(fit["shape_time"], AGE)[0, 1] > 0.3
     assert fit.attrs["subjects"] == 8
     assert fit.attrs["once"] == 0
-    beside = growth(simulated, "age", "person", covariates="sex", n_permutations=199)
-    assert np.array_equal(beside["p_vertex"], fit["p_vertex"])
+    adjusted = growth(simulated, "age", "person", covariates="sex", n_permutations=199)
+    assert np.array_equal(adjusted["p_vertex"], fit["p_vertex"])
     signs = growth(simulated, "age", "person", of="normal", variances="unequal", n_permutations=199)
     assert signs.attrs["smallest_p"] == 2**-7
     assert signs["p_value"] <= 0.02
@@ -124,7 +124,7 @@ def test_a_field_grows_too(simulated):
     assert np.allclose(fit["field_within_effect"].values[TOP], 0.4, atol=0.1)
     assert fit["field_effect"].attrs["units"] == "mm"
     assert (fit["p_family_wise"].values[TOP] < 0.05).all()
-    with pytest.raises(ValueError, match="show the field_effect"):
+    with pytest.raises(ValueError, match="a regression of displacements is needed"):
         statistics.predict(study, fit, 1.0)
 
 
@@ -143,13 +143,13 @@ def test_orders_leave_every_visit_with_its_subject_and_are_all_different():
     signs = [tuple(one) for one in signs]
     assert len(set(signs)) == n == 3
     assert all(one[0] == one[2] and one[1] == one[3] == one[4] for one in signs)
-    # two visits each: all turned round give the same slope but for its sign
+    # two visits each: reversing all gives the same slope with the other sign
     pairs = np.repeat(np.arange(5), 2)
     assert Model(np.arange(10.0), blocks=pairs).smallest_p == 2 / 2**5
     assert Model(np.arange(10.0) ** 2, blocks=np.repeat([0, 1], 5)).smallest_p == 1 / 1000
 
 
-def test_changes_of_nothing_are_found_no_more_often_than_said():
+def test_the_test_of_change_keeps_its_level_under_the_null_hypothesis():
     found = []
     for run in range(150):
         rng = np.random.default_rng([7, run])
@@ -166,13 +166,13 @@ def test_changes_of_nothing_are_found_no_more_often_than_said():
     assert np.all(np.mean(found, axis=0) < 0.11)
 
 
-def test_what_is_no_repeated_measure_is_refused_or_told(simulated, caplog):
+def test_single_visits_are_refused_or_reported(simulated, caplog):
     caplog.set_level(logging.WARNING)
     person = simulated["subjects"]["person"].values
     options = {"n_permutations": 99}
-    with pytest.raises(ValueError, match="two subjects that were seen at different times, found 0"):
+    with pytest.raises(ValueError, match="two subjects with visits at different times, found 0"):
         growth(simulated, "age", [f"q{i}" for i in range(24)], **options)
-    with pytest.raises(ValueError, match="needs a time of numbers; found text such as 'f'"):
+    with pytest.raises(ValueError, match="needs a time of numbers, found text such as 'f'"):
         growth(simulated, "sex", "person", **options)
     with pytest.raises(ValueError, match="24 shapes"):
         growth(simulated, "age", ["a", "b"], **options)
@@ -183,7 +183,7 @@ def test_what_is_no_repeated_measure_is_refused_or_told(simulated, caplog):
     caplog.clear()
     alone = np.where(np.arange(24) == 23, "alone", person)
     fit = growth(simulated, "age", alone, **options)
-    assert "seen at one time only" in caplog.text
+    assert "visits at one time only" in caplog.text
     assert "alone" in caplog.text
     assert fit.attrs["once"] == 1
     unknown = np.where(np.arange(24) == 5, "", person)
@@ -209,8 +209,8 @@ def test_the_command_writes_the_trajectory(study_folder, tmp_path, capsys):
     words = ["growth", str(folder), "--time", "age", "--subject", "id", "--table", str(table)]
     words += ["--of", "normal", "--permutations", "19"]
     assert cli.main(words) == 0
-    told = capsys.readouterr().out
-    assert "4 visits of 2 subjects" in told
+    printed = capsys.readouterr().out
+    assert "4 visits of 2 subjects" in printed
     out = folder / "statistics"
     assert {path.name for path in out.iterdir()} >= {
         "growth.nc",

@@ -14,7 +14,7 @@ from s4a.geometry.mesh import vertex_areas
 from s4a.input.subjects import subjects as table_of
 from s4a.schema import dataset, in_unit
 from s4a_morphometrics import of_structure, structures, structures_modes, structures_of_new, within
-from s4a_morphometrics.poses import align_wholes, measured, pose_fields, poses_of
+from s4a_morphometrics.poses import align_wholes, measure_levels, pose_fields, poses_of
 from s4a_morphometrics.synthetic import bean, subjects
 
 SPHERE = s4a.synthetic.sphere(120)
@@ -69,7 +69,7 @@ def tree_of_new(Y, study):
 
 
 def without_poses(Y):
-    """Points of which every structure is moved back to one place."""
+    """Points with all structures moved to a common pose."""
     found = [poses_of(Y[:, k], AREA) for k in range(2)]
     return np.stack([one.mean + one.shape for one in found], axis=1)
 
@@ -80,7 +80,7 @@ def share(found, level):
 
 
 def test_the_two_levels_add_up_to_the_joint_one_without_a_rest():
-    study = tree_of(drawn(0, pose=2, shape=3))  # turns of 11 degrees, so that nothing is small
+    study = tree_of(drawn(0, pose=2, shape=3))  # rotations of 11 degrees, which are not small
     found = structures(study, **FEW)
     assert share(found, "between") > 0.15 < share(found, "within")
     assert float(found["level_share"].sum()) == pytest.approx(1, abs=1e-12)
@@ -94,7 +94,7 @@ def test_the_two_levels_add_up_to_the_joint_one_without_a_rest():
     assert np.allclose(joint["standard_deviation"], found["standard_deviation"], rtol=1e-5)
 
 
-def test_shapes_have_no_shift_and_no_turn_left():
+def test_shapes_have_no_translation_or_rotation():
     Y = drawn(1, pose=3, shape=2)[:, 0]
     found = poses_of(Y, AREA)
     g = AREA @ found.mean / AREA.sum()
@@ -127,12 +127,12 @@ def test_known_poses_are_found_relative_to_the_whole():
     found = structures(tree_of(Y), **FEW)
     rotation, translation = found["pose_rotation"].values, found["pose_translation"].values
     assert np.allclose(rotation[:, 0] - rotation[:, 1], sign * turn, atol=0.02)
-    # the whole is turned back: the structures lie 32 mm from each other
+    # the alignment rotates the whole back: the structures are 32 mm independent
     assert np.allclose((translation[:, 0] - translation[:, 1])[:, 0], 0, atol=0.2)
     assert (np.sign(rotation[:, 0, 2]) == sign[:, 0]).all()
 
 
-def test_where_a_subject_lies_in_its_scan_changes_nothing():
+def test_the_pose_of_a_subject_in_its_scan_has_no_effect():
     Y = drawn(3, pose=1, shape=1)
     rng = np.random.default_rng(0)
     frames = Rotation.from_rotvec(2 * rng.normal(size=(N, 3))).as_matrix()
@@ -142,23 +142,23 @@ def test_where_a_subject_lies_in_its_scan_changes_nothing():
     assert np.allclose(one["pose_size"], other["pose_size"], rtol=1e-6)
 
 
-def test_size_of_the_whole_is_taken_out_on_request():
+def test_size_of_the_whole_is_removed_on_request():
     Y = np.broadcast_to(BEAN + APART[:, None], (N, 2, *BEAN.shape))
     Y = Y * np.random.default_rng(0).uniform(0.8, 1.2, N)[:, None, None, None]
     assert share(structures(tree_of(Y), **FEW), "within") > 0.1
     with pytest.raises(ValueError, match="structures need subjects that differ"):
-        structures(tree_of(Y), scale=True)
+        structures(tree_of(Y), remove_size=True)
 
 
-def test_poses_and_shapes_that_vary_together_are_told_from_those_that_do_not():
+def test_covarying_poses_and_shapes_are_distinguished_from_independent_ones():
     rng = np.random.default_rng(5)
-    apart = drawn(6, pose=1, shape=1, n=16)
-    together = np.empty_like(apart)
+    independent = drawn(6, pose=1, shape=1, n=16)
+    together = np.empty_like(independent)
     for i, score in enumerate(rng.normal(size=16)):
         for k in range(2):
             together[i, k] = bean(U, 0.15 * score) + APART[k] + [0, 2.0 * score * (-1) ** k, 0]
-    still = without_poses(apart)
-    shifted = still + (apart - still).mean(2)[:, :, None]
+    still = without_poses(independent)
+    shifted = still + (independent - still).mean(2)[:, :, None]
     p = [
         float(structures(tree_of(Y), n_permutations=199)["pose_shape_p"])
         for Y in (together, shifted)
@@ -182,7 +182,7 @@ def test_a_group_that_differs_in_poses_is_found_between_structures_and_not_withi
     assert p["within"] > 0.05
 
 
-def test_a_level_is_a_study_for_what_takes_one(tmp_path):
+def test_a_level_is_a_study_for_tests_and_pages(tmp_path):
     study = tree_of(drawn(0, pose=1, shape=1))
     found = structures(study, **FEW)
     of_level = structures_modes(study, found, "between")
@@ -227,33 +227,33 @@ def in_metres(Y):
 @pytest.mark.parametrize(
     "fault, words",
     [
-        (far_away, ["lie far from where they are in the other subjects", "s04 ("]),
+        (far_away, ["unusual relative pose", "s04 ("]),
         (mirrored, ["s04 ("]),
         (centred, ["left and right have the same centre in every subject"]),
         (in_metres, ["times as large as right: are both in the same unit?"]),
     ],
 )
-def test_structures_that_do_not_fit_together_are_told_of(fault, words, caplog):
+def test_structures_that_do_not_fit_together_are_reported(fault, words, caplog):
     Y = drawn(9, pose=1, shape=1)
     fault(Y)
     structures(tree_of(Y), **FEW)
     assert all(word in caplog.text for word in words)
 
 
-def test_usual_poses_are_not_told_of(caplog):
+def test_usual_poses_are_not_reported(caplog):
     for seed in range(20):
         structures(tree_of(drawn(seed, pose=1, shape=1)), **FEW)
     assert not caplog.text
 
 
-def test_what_cannot_be_compared_is_refused():
+def test_structures_that_cannot_be_compared_are_refused():
     study = tree_of(drawn(0, pose=1))
     right = study["structures/right/registration"].to_dataset()
-    with pytest.raises(ValueError, match="a study of several structures needed"):
+    with pytest.raises(ValueError, match="a multi-structure study needed"):
         structures(of_structure(study, "left"))
     with pytest.raises(ValueError, match="no structure 'middle'; it has left, right"):
         of_structure(study, "middle")
-    with pytest.raises(ValueError, match="at least 4 subjects that have all of them, found 3 of 3"):
+    with pytest.raises(ValueError, match="at least 4 subjects with all structures needed, found 3"):
         structures(tree_of(drawn(0, pose=1, n=3)))
     study["structures/right/registration"] = xr.DataTree(in_unit(right, "m", of="mm"))
     with pytest.raises(ValueError, match="structures need one unit; found left: mm, right: m"):
@@ -266,17 +266,17 @@ def test_warnings_name_the_subject_that_lacks_a_structure(caplog):
     study["structures/left/registration"] = xr.DataTree(left)
     with caplog.at_level(logging.WARNING):
         assert structures(study, **FEW).sizes["shape"] == N - 1
-    assert "left out, as a structure is missing or flagged: s00 (no left)" in caplog.text
+    assert "left out, because a structure is missing or flagged: s00 (no left)" in caplog.text
 
 
 # ---- new subjects
 
 
-@pytest.mark.parametrize("scale", [False, True])
-def test_a_new_subject_is_where_it_would_be_in_the_study(scale):
+@pytest.mark.parametrize("remove_size", [False, True])
+def test_a_new_subject_is_where_it_would_be_in_the_study(remove_size):
     Y = drawn(3, pose=1, shape=1) * np.linspace(0.9, 1.1, N)[:, None, None, None]
     study = tree_of(Y)
-    found = structures(study, scale=scale, **FEW)
+    found = structures(study, remove_size=remove_size, **FEW)
     Q = Rotation.from_rotvec([0.2, -0.4, 0.3]).as_matrix()
     again = structures_of_new(found, tree_of_new(Y @ Q.T + [5, 0, -3], study))
     for name in ("pose_rotation", "pose_translation", "pose_size", "within_displacement"):
@@ -342,7 +342,7 @@ def test_of_registered_meshes_the_poses_and_shapes_are_those_that_were_made(seve
     areas = [vertex_areas(one["position"].values, one["corner_vertex"].values) for one in template]
     whole = align_wholes(np.array(points).reshape(6, 400, 3), np.concatenate(areas))
     each = [poses_of(whole[:, :200], areas[0]), poses_of(whole[:, 200:], areas[1])]
-    truth = measured(each, areas, **FEW)
+    truth = measure_levels(each, areas, **FEW)
     d = pose_fields(each[0].mean, areas[0], each[0].rotation, each[0].translation)
     rms = np.sqrt(np.einsum("n,snx->s", areas[0] / areas[0].sum(), d**2))
     assert np.allclose(truth["pose_size"][:, 0], rms)

@@ -1,6 +1,6 @@
 """Files for other programs: read back as those programs read them, they hold what the study does.
 
-Nothing of :mod:`s4a` reads here, but where it says so.
+No function of :mod:`s4a` reads the files, except where stated.
 """
 
 import base64
@@ -70,8 +70,8 @@ def test_shapeworks_finds_meshes_and_particles_that_its_alignment_takes_to_the_w
         assert near.min(1).max() < 1e-4  # each is a vertex of the registered shape
         X, _, _ = read_mesh(tmp_path / row["shape_1"])
         assert X == pytest.approx(tabled["original"][row["name"]]["position"].values, abs=1e-3)
-        gap = np.linalg.norm(X[None] - local[:, None], axis=2).min(1)
-        assert gap.mean() < 8  # mm: particles lie on the mesh, as well as it was registered
+        distance = np.linalg.norm(X[None] - local[:, None], axis=2).min(1)
+        assert distance.mean() < 8  # mm: particles lie on the mesh, as well as it was registered
     assert project["optimize"] == {"number_of_particles": "50"}
 
 
@@ -125,14 +125,14 @@ def test_scalismo_reads_the_gaussian_of_the_modes(study, tmp_path):
 def test_a_model_of_scalismo_is_read_as_modes_of_the_same_spread(study, tmp_path):
     (path,) = write_for(study, tmp_path, "scalismo", n_modes=2)
     model = read_scalismo(path)
-    spread = model["pca"]["standard_deviation"].values
-    assert len(spread) == 2
+    deviations = model["pca"]["standard_deviation"].values
+    assert len(deviations) == 2
     known = study["pca"]["standard_deviation"].values[:2]
-    assert (spread**2).sum() == pytest.approx((known**2).sum(), rel=1e-4)
+    assert (deviations**2).sum() == pytest.approx((known**2).sum(), rel=1e-4)
     moved = s4a.synthesize(model, [1.0])["position"] - s4a.synthesize(model, [0.0])["position"]
     area = vertex_areas(*as_arrays(model["registration"].to_dataset()))
     root = np.sqrt(area @ (moved.values**2).sum(1) / area.sum())
-    assert root == pytest.approx(spread[0], rel=1e-4)
+    assert root == pytest.approx(deviations[0], rel=1e-4)
 
 
 def test_a_model_of_the_first_statismo_has_its_deviations_in_its_basis(study, tmp_path):
@@ -149,7 +149,7 @@ def test_a_model_of_the_first_statismo_has_its_deviations_in_its_basis(study, tm
     )
 
 
-def test_what_is_no_model_is_refused_by_what_it_lacks(study, tmp_path):
+def test_invalid_models_are_refused_with_the_missing_part(study, tmp_path):
     (path,) = write_for(study, tmp_path, "scalismo")
     cut, other = tmp_path / "cut.h5", tmp_path / "other.h5"
     shutil.copy(path, cut)
@@ -267,7 +267,7 @@ def test_a_file_as_slicer_writes_it_is_read_and_written_again(tmp_path, system, 
     assert read_landmarks(tmp_path / "ours.mrk.json").identical(read)
     ours = json.loads((tmp_path / "ours.mrk.json").read_text())["markups"]
     assert [one["type"] for one in ours] == ["Fiducial", "ClosedCurve"]
-    # both axes of a point are turned between LPS and RAS, so that it stands upright
+    # LPS and RAS differ in the signs of two axes
     axes = np.reshape(ours[0]["controlPoints"][0]["orientation"], (3, 3))
     assert np.diag(axes).tolist() == [sign, sign, 1]
 
@@ -277,10 +277,10 @@ def test_markups_without_a_frame_are_lps_as_slicer_takes_them(tmp_path):
     write_landmarks(tmp_path / "a.mrk.json", marks)
     found = json.loads((tmp_path / "a.mrk.json").read_text())["markups"][0]
     assert found["coordinateSystem"] == "LPS"
-    assert "coordinateUnits" not in found  # of a length without a unit nothing is said
+    assert "coordinateUnits" not in found  # no unit is written if the unit is unknown
 
 
-def test_slicer_has_surfaces_points_and_landmarks_where_the_files_lie(study, tmp_path):
+def test_slicer_has_surfaces_points_and_landmarks_in_the_frames_of_the_files(study, tmp_path):
     write_for(study, tmp_path, "slicer", n_points=25)
     data = study["registration"].to_dataset()
     for name in data["shape"].values.tolist():
@@ -298,11 +298,11 @@ def test_slicer_has_surfaces_points_and_landmarks_where_the_files_lie(study, tmp
         marks = read_landmarks(tmp_path / "landmarks" / f"{name}.mrk.json")
         own = study["original"][name].to_dataset()
         assert marks["landmark_name"].values.tolist() == own["landmark_name"].values.tolist()
-        gap = marks["landmark_position"].values - own["landmark_position"].values
-        assert np.linalg.norm(gap, axis=1).mean() < 15  # mm, few vertices
+        distance = marks["landmark_position"].values - own["landmark_position"].values
+        assert np.linalg.norm(distance, axis=1).mean() < 15  # mm, few vertices
 
 
-def test_landmarks_of_the_other_frame_are_written_where_the_template_lies(study, tmp_path):
+def test_landmarks_of_the_other_frame_are_written_in_the_frame_of_the_template(study, tmp_path):
     name = study["registration"].attrs["template"]
     Y = study["original"][name]["position"].values[[5, 200, 400]]
     given = dataset(
@@ -316,7 +316,7 @@ def test_landmarks_of_the_other_frame_are_written_where_the_template_lies(study,
     assert written["landmark_position"].values == pytest.approx(Y, abs=1e-5)
 
 
-def test_slicer_is_told_where_no_file_says_its_frame(study, tmp_path, caplog):
+def test_files_without_a_frame_are_reported_for_slicer(study, tmp_path, caplog):
     plain = study.copy(deep=True)
     for node in plain["original"].children.values():
         node.attrs.pop("coordinate_system")
@@ -327,7 +327,7 @@ def test_slicer_is_told_where_no_file_says_its_frame(study, tmp_path, caplog):
     assert b"SPACE" not in (tmp_path / f"{name}.vtk").read_bytes()[:200]
 
 
-def test_a_mirrored_shape_is_written_where_its_file_lies(study, tmp_path):
+def test_a_mirrored_shape_is_written_in_the_frame_of_its_file(study, tmp_path):
     mirrored = study.copy(deep=True)
     name = study["registration"]["shape"].values[1]
     mirrored["original"][name].attrs["reflected"] = 1
@@ -350,7 +350,7 @@ AFFINE = np.array([[-2.0, 0, 0, 30], [0, 0, 2, -28], [0, 2, 0, -26], [0, 0, 0, 1
 
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory):
-    """Four label volumes, turned and mirrored as scans are, and the study of label 2."""
+    """Four label volumes, rotated and mirrored like scans, and the study of label 2."""
     pytest.importorskip("skimage")
     folder = tmp_path_factory.mktemp("scans")
     place = np.stack(np.meshgrid(*[np.arange(28)] * 3, indexing="ij"), -1) - 14
@@ -364,7 +364,7 @@ def scans(tmp_path_factory):
     return folder, study
 
 
-def halves(study):
+def sides(study):
     """Labels of the template: 5 where the world's x is positive, else 9."""
     name = study["registration"].attrs["template"]
     X = study["original"][name]["position"].values
@@ -373,7 +373,7 @@ def halves(study):
 
 def test_labels_fill_the_voxels_that_made_each_shape_in_the_grid_of_its_scan(scans, tmp_path):
     folder, study = scans
-    paths = write_for(study, tmp_path, "nifti", label=halves(study))
+    paths = write_for(study, tmp_path, "nifti", label=sides(study))
     assert [path.name for path in paths] == [f"scan_{i}.nii.gz" for i in range(4)]
     template = study["registration"].attrs["template"]
     for path in paths:
@@ -390,14 +390,14 @@ def test_labels_fill_the_voxels_that_made_each_shape_in_the_grid_of_its_scan(sca
         assert ((x > np.median(own)) == (values[marked] == 5))[far].mean() > 0.99
 
 
-def test_labels_fill_what_lies_within_a_shape_in_any_grid(scans, tmp_path):
+def test_labels_fill_the_interior_of_a_shape_in_any_grid(scans, tmp_path):
     folder, study = scans
     other = np.diag([1.5, 1.5, 1.5, 1]).astype(float)
     other[:3, 3] = [-30, -32, -30]
     grid = tmp_path / "grid.nii.gz"
     grey = np.random.default_rng(0).random((40, 44, 42)).astype(np.float32)
     nibabel.save(nibabel.Nifti1Image(grey, other), grid)
-    paths = write_for(study, tmp_path / "out", "nifti", label=halves(study), grid=grid)
+    paths = write_for(study, tmp_path / "out", "nifti", label=sides(study), grid=grid)
     for path in paths:
         found, scan = nibabel.load(path), nibabel.load(folder / path.name)
         assert np.array_equal(found.affine, other)
@@ -413,7 +413,7 @@ def test_labels_fill_what_lies_within_a_shape_in_any_grid(scans, tmp_path):
 def test_a_mesh_in_lps_and_one_that_was_mirrored_fill_the_same_voxels(scans, tmp_path):
     folder, study = scans
     grid = folder / "scan_0.nii.gz"
-    (known, *_) = write_for(study, tmp_path / "a", "nifti", label=halves(study), grid=grid)
+    (known, *_) = write_for(study, tmp_path / "a", "nifti", label=sides(study), grid=grid)
     turned = study.copy(deep=True)
     registration, node = turned["registration"], turned["original"]["scan_0"]
     node["position"] = node["position"] * [-1, -1, 1]
@@ -423,7 +423,7 @@ def test_a_mesh_in_lps_and_one_that_was_mirrored_fill_the_same_voxels(scans, tmp
     R[first] = R[first] @ np.diag([-1.0, -1, 1])
     registration["rotation"] = registration["rotation"].copy(data=R)
     if registration.attrs["template"] != "scan_0":
-        (found, *_) = write_for(turned, tmp_path / "b", "nifti", label=halves(study), grid=grid)
+        (found, *_) = write_for(turned, tmp_path / "b", "nifti", label=sides(study), grid=grid)
         assert np.array_equal(nibabel.load(found).dataobj, nibabel.load(known).dataobj)
 
 
@@ -444,7 +444,7 @@ def test_a_mesh_in_lps_and_one_that_was_mirrored_fill_the_same_voxels(scans, tmp
         ("nifti", {"grid": "none.nii"}, "no file .*none.nii"),
     ],
 )
-def test_an_error_says_what_was_needed(study, tmp_path, program, options, words):
+def test_an_error_names_what_was_expected(study, tmp_path, program, options, words):
     with pytest.raises(ValueError, match=words):
         write_for(study, tmp_path / "out", program, **options)
 
@@ -463,18 +463,16 @@ def test_every_program_needs_a_registered_study(brains, tmp_path):
             write_for(brains, tmp_path, program)
 
 
-def test_a_grid_elsewhere_is_refused_and_says_where_the_surface_lies(scans, tmp_path):
+def test_a_grid_elsewhere_is_refused_with_the_position_of_the_surface(scans, tmp_path):
     _, study = scans
     far = AFFINE.copy()
     far[:3, 3] += 5000
     nibabel.save(nibabel.Nifti1Image(np.zeros((9, 9, 9), np.uint8), far), tmp_path / "far.nii")
     with pytest.raises(ValueError, match=r"no voxel of .*far.nii is inside scan_0, .* mm \(RAS\)"):
-        write_for(study, tmp_path, "nifti", label=halves(study), grid=tmp_path / "far.nii")
+        write_for(study, tmp_path, "nifti", label=sides(study), grid=tmp_path / "far.nii")
 
 
-def test_the_command_writes_for_a_program_and_refuses_what_it_does_not_take(
-    study_folder, study, tmp_path, capsys
-):
+def test_the_command_exports_and_refuses_unknown_options(study_folder, study, tmp_path, capsys):
     out = str(tmp_path / "out")
     assert main(["export", str(study_folder), "--to", "slicer", "--out", out, "--points", "9"]) == 0
     assert "12 files for slicer" in capsys.readouterr().out

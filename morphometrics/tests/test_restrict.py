@@ -14,7 +14,7 @@ from s4a_morphometrics import with_size, within, without
 
 @pytest.fixture(scope="module")
 def simulated():
-    """Twenty shapes: groups differ above, age moves all, as strongly as nothing else."""
+    """Twenty shapes: groups differ at the top, and age has the strongest effect everywhere."""
     rng = np.random.default_rng(0)
     group = np.repeat(["a", "b"], 10)
     age = rng.permutation(20).astype(float)
@@ -84,7 +84,7 @@ def test_labels_of_a_region_can_be_given(simulated):
         within(bare, 7)
 
 
-def test_without_a_nuisance_nothing_follows_it_and_no_mode_lies_along_it(simulated):
+def test_without_a_nuisance_no_displacement_or_mode_depends_on_it(simulated):
     rest = without(simulated, "age")
     fit = statistics.regression(simulated, "age", n_permutations=9)
     after = statistics.regression(rest, "age", n_permutations=99)
@@ -130,10 +130,10 @@ def test_size_that_was_taken_out_is_given_back():
     np.testing.assert_allclose(radius(back), radius(kept), rtol=0.02)
     assert back["pca"]["explained_variance_ratio"].values[0] > 0.8
     position = scaled["registration"]["position"].values
-    for name in shapes:  # where the files lie, before and after
+    for name in shapes:  # in the frames of the files, before and after
         ends = [image_in_shape(position, s["registration"].sel(shape=name)) for s in (scaled, back)]
         assert np.allclose(*ends, atol=1e-4)
-    with pytest.raises(ValueError, match="size was not taken out"):
+    with pytest.raises(ValueError, match="of this study include size"):
         with_size(kept)
 
 

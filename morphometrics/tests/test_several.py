@@ -1,4 +1,4 @@
-"""Studies of several structures of each subject: whose is which, mirrored subjects, new ones."""
+"""Multi-structure studies: shapes by subject, mirrored subjects, new subjects."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from s4a_morphometrics import (
     structures_modes,
     structures_of_new,
 )
-from s4a_morphometrics.mirrored import mirrored_subjects, seen_together
+from s4a_morphometrics.mirrored import combine, mirrored_subjects
 from s4a_morphometrics.several import Part, named_subjects, parts_of
 from s4a_morphometrics.structures_commands import named_label
 from s4a_morphometrics.synthetic import subjects
@@ -99,7 +99,7 @@ def new():
     return subjects(8, 200, seed=1)["subject_1"]
 
 
-def test_each_structure_is_a_study_of_its_own_as_its_meshes_alone_give_it(store, study, files, six):
+def test_each_structure_has_the_same_study_as_its_meshes_alone(store, study, files, six):
     assert list(study["structures"].children) == list(SIDES)
     left = of_structure(study, "left")
     assert left["subjects"]["age"].values.tolist() == [30, 31, 32, 33, 34, 35]
@@ -120,13 +120,13 @@ def test_a_second_run_finds_all_done(files, store):
     assert made == {path: path.stat().st_mtime_ns for path in store.rglob("structures/*/*/*.nc")}
 
 
-def test_folders_of_one_and_of_several_are_not_taken_for_each_other(store, files, tmp_path):
+def test_folders_of_one_and_of_several_structures_are_not_confused(store, files, tmp_path):
     for command in (s4a.open_study, s4a.verify):
         with pytest.raises(ValueError, match=r"contains studies: give one of them.*ures.left"):
             command(store)
-    with pytest.raises(ValueError, match="is no study of several structures"):
+    with pytest.raises(ValueError, match="is not a multi-structure study"):
         open_structures(store / "structures/left")
-    with pytest.raises(ValueError, match="is no study of several structures and is not empty"):
+    with pytest.raises(ValueError, match="is not a multi-structure study and is not empty"):
         analyse_structures(files[0], table=files[1], store=store / "structures/left", **SMALL)
     (tmp_path / "structures").mkdir()
     (tmp_path / "structures/left").symlink_to(store / "structures/left")
@@ -134,7 +134,7 @@ def test_folders_of_one_and_of_several_are_not_taken_for_each_other(store, files
     with pytest.raises(ValueError, match="is a symbolic link, which is not followed"):
         open_structures(tmp_path)
     (tmp_path / "structures.json").write_text('{"structures": ["../left"]}')
-    with pytest.raises(ValueError, match=r"structures.json cannot be read, run again: shapes need"):
+    with pytest.raises(ValueError, match=r"structures.json cannot be read, run again: names"):
         open_structures(tmp_path)
 
 
@@ -149,12 +149,16 @@ def test_the_core_says_who_analyses_several_structures(six, files):
     "old, by, words",
     [
         ("subject_2,right", "subject_1,right", "has two of right: scan_right_0, scan_right_1"),
-        ("subject,", "person,", "columns 'structure' and 'subject' needed beside 'shape'; found"),
+        (
+            "subject,",
+            "person,",
+            "columns 'structure' and 'subject' needed in addition to 'shape'; found",
+        ),
         ("subject_2,right", "subject_2,NA", "scan_right_1 has 'NA' and 'subject_2'"),
         (",right,", ",left,", "has two of left"),
     ],
 )
-def test_tables_that_do_not_say_whose_a_shape_is_are_refused(old, by, words, files, tmp_path):
+def test_tables_without_subjects_or_structures_are_refused(old, by, words, files, tmp_path):
     wrong = tmp_path / "table.csv"
     wrong.write_text(files[1].read_text().replace(old, by))
     with pytest.raises(ValueError, match=words):
@@ -181,7 +185,7 @@ THREE = {f"subject_{i}": TWO for i in (1, 2, 3)}
         ({"a": {"le/ft": MESH, "right": MESH}}, {}, "names of shapes need"),
         ({"a": {"left": "no.ply", "right": MESH}, "b": TWO}, {}, "left: shape a: no.ply is no fil"),
         (THREE, {"template": "d"}, "template 'd' is none of the shapes"),
-        ({"a": TWO, "b": {"left": MESH}}, {}, "least 2 subjects that have it; right has a alone"),
+        ({"a": TWO, "b": {"left": MESH}}, {}, "least 2 subjects that have it; right has only a"),
         ({"a": TWO, "b": {}}, {}, "a mesh of a structure needed; b has none"),
     ],
 )
@@ -204,12 +208,12 @@ def test_the_commands_insert_and_compare(store, study, new, tmp_path, capsys):
     both = tmp_path / "both"
     words = ["structures", str(store), "--permutations", "9", "--out", str(both)]
     assert cli.main([*words, "--new", str(out)]) == 0
-    said = capsys.readouterr().out
-    assert "5 subjects" in said
-    rows = {line.split()[0]: line for line in said.splitlines() if line.strip()}
+    printed = capsys.readouterr().out
+    assert "5 subjects" in printed
+    rows = {line.split()[0]: line for line in printed.splitlines() if line.strip()}
     shares = [float(cell) for cell in rows["all"].replace("%", "").split()[-2:]]
     assert sum(shares) == pytest.approx(100, abs=0.11)
-    assert said.count("  new: Mahalanobis") == 3
+    assert printed.count("  new: Mahalanobis") == 3
     assert {path.stem for path in both.glob("*.html")} == {"joint", "between", "within"}
     found = structures(study, n_permutations=9)
     joint = structures_modes(study, found, "joint", structures_of_new(found, direct))["pca"]
@@ -221,7 +225,7 @@ def test_the_commands_insert_and_compare(store, study, new, tmp_path, capsys):
         cli.main(["run-structures", "scans", "--out", "x", "--structures", "left"])
 
 
-def test_what_a_new_subject_lacks_is_told_and_costs_its_other_structures_nothing(study, new):
+def test_a_missing_structure_of_a_new_subject_is_reported_and_the_others_are_inserted(study, new):
     spoilt = {"left": s4a.synthetic.sphere(9), "right": new["right"]}
     given = {"a": new, "b": {"left": new["left"]}}
     both = insert_structures(study, given, n_jobs=1)["report"]
@@ -234,7 +238,7 @@ def test_what_a_new_subject_lacks_is_told_and_costs_its_other_structures_nothing
     xr.testing.assert_equal(inserted["structures/right/pca"]["score"], alone["pca"]["score"])
 
 
-def test_what_cannot_be_inserted_is_refused(study, tmp_path):
+def test_invalid_new_subjects_are_refused(study, tmp_path):
     template = study["structures/left/registration"].attrs["template"]
     for given, options, words in [
         ({"new": MESH}, {}, r"several structures \(left, right\): {subject: {structure"),
@@ -277,7 +281,7 @@ def test_label_volumes_hold_a_structure_in_each_label(tmp_path):
 # ---- landmarks
 
 
-def test_landmarks_of_folders_and_of_a_table_do_what_those_in_memory_do(tmp_path, new, caplog):
+def test_landmarks_of_folders_and_tables_have_the_effect_of_those_in_memory(tmp_path, new, caplog):
     three = subjects(3, 200)
     folder = marked(three, tmp_path / "marks")
     (folder / "right/subject_3.csv").unlink()
@@ -321,7 +325,7 @@ def test_landmarks_of_folders_and_of_a_table_do_what_those_in_memory_do(tmp_path
 
 @pytest.fixture(scope="module")
 def four():
-    """Subjects that are all of one hand."""
+    """Subjects that are all of one side."""
     return subjects(4, 200)
 
 
@@ -362,12 +366,12 @@ def test_poses_and_modes_of_mirrored_subjects_are_those_of_the_subjects(
             np.testing.assert_allclose(result[name], true[name], atol=precision, err_msg=name)
     turn = abs(structures(wrong, n_permutations=9)["pose_rotation"]).max()
     assert turn > 1.5 * abs(true["pose_rotation"]).max()
-    hand = found["report"]["mean_chirality"]
-    assert (hand.sel(shape=ODD) < -1).all()
-    assert (hand.drop_sel(shape=ODD) > 1).all()
+    chirality = found["report"]["mean_chirality"]
+    assert (chirality.sel(shape=ODD) < -1).all()
+    assert (chirality.drop_sel(shape=ODD) > 1).all()
 
 
-def test_a_new_subject_of_the_other_hand_is_mirrored_as_a_whole(found, new):
+def test_a_new_subject_of_the_other_side_is_mirrored_as_a_whole(found, new):
     true = insert_structures(found, {"new": new}, n_jobs=1)
     assert "reflected" not in true["report"]
     for reflect in (["new"], "auto"):
@@ -392,10 +396,10 @@ def test_structures_of_one_subject_are_mirrored_together_or_not_at_all():
         named_subjects("side=l", parts)
 
 
-def looks(hands):
-    """Of a, b, c and d beside each other, where `hands` are the signs of their hands."""
+def comparisons(signs):
+    """Comparisons of a, b, c and d, whose sides have these `signs`."""
     names = list("abcd")
-    table = np.outer(hands, hands) + np.diag([np.nan] * 4)
+    table = np.outer(signs, signs) + np.diag([np.nan] * 4)
     return {
         name: dataset(chirality=row).assign_coords(reference=names)
         for name, row in zip(names, table, strict=True)
@@ -403,31 +407,36 @@ def looks(hands):
 
 
 @pytest.mark.parametrize(
-    "left, right, chosen, told",
+    "left, right, mirrored, remarks",
     [
         ([0.9, 0.9, -0.9, 0.9], [0.9, 0.9, -0.9, 0.9], ["c"], []),
-        # one that is like its mirror image says nothing against the other
+        # a structure that equals its mirror image has no influence
         ([1.2, 1.2, -1.2, 1.2], [0.1] * 4, ["c"], []),
-        ([1.2, 1.2, -1.2, 1.2], [1.2] * 4, [], ["c is of both hands (left -1.44, right +1.44)"]),
-        # where one structure says more than the other, too
-        ([1.2, 1.2, -3, 1.2], [1.2, 1.2, 0.9, 1.2], [], ["c is of both hands (left -"]),
+        (
+            [1.2, 1.2, -1.2, 1.2],
+            [1.2] * 4,
+            [],
+            ["c has structures of both sides (left -1.44, right +1.44)"],
+        ),
+        # also if one structure has larger values than the other
+        ([1.2, 1.2, -3, 1.2], [1.2, 1.2, 0.9, 1.2], [], ["c has structures of both sides (left -"]),
         (
             [1.8, 1.8, -1.8, 0.1],
             [1.8, 1.8, 1.8, 0.1],
             [],
-            ["cannot determine the side of d", "c is of both hands (left -"],
+            ["cannot determine the side of d", "c has structures of both sides (left -"],
         ),
     ],
 )
-def test_structures_say_together_of_which_hand_a_subject_is(left, right, chosen, told):
-    _, names, lines = mirrored_subjects({"left": looks(left), "right": looks(right)})
-    assert names == chosen
-    assert all(word in line for word, line in zip(told, lines, strict=True))
+def test_structures_together_determine_the_side_of_a_subject(left, right, mirrored, remarks):
+    _, names, lines = mirrored_subjects({"left": comparisons(left), "right": comparisons(right)})
+    assert names == mirrored
+    assert all(word in line for word, line in zip(remarks, lines, strict=True))
 
 
-def test_hands_add_up_and_one_subject_alone_is_of_no_hand():
-    both = {"left": looks([0.9, 0.9, -0.9, 0.9]), "right": looks([0.9, 0.9, -0.9, 0.9])}
-    assert seen_together(both)["a"]["chirality"].values[1] == pytest.approx(2 * 0.81 / np.sqrt(2))
-    hand, names, told = mirrored_subjects({"left": {}, "right": {}})
-    assert (hand, names) == ({}, [])
-    assert "needs at least two shapes" in told[0]
+def test_comparisons_are_added_and_a_single_subject_has_no_side():
+    both = {"left": comparisons([0.9, 0.9, -0.9, 0.9]), "right": comparisons([0.9, 0.9, -0.9, 0.9])}
+    assert combine(both)["a"]["chirality"].values[1] == pytest.approx(2 * 0.81 / np.sqrt(2))
+    chirality, names, remarks = mirrored_subjects({"left": {}, "right": {}})
+    assert (chirality, names) == ({}, [])
+    assert "needs at least two shapes" in remarks[0]

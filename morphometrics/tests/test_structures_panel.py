@@ -1,4 +1,4 @@
-"""The panel of several structures, without a browser."""
+"""The panel of multi-structure studies, without a browser."""
 
 import numpy as np
 import pytest
@@ -14,9 +14,9 @@ from s4a_morphometrics.structures_panel import Structures
 
 @pytest.fixture
 def panel(several):
-    """The panel, of which nothing is left after the test."""
+    """The panel; all its widgets are closed after the test."""
     before = len(registry._instances)
-    made = Structures(several, found=structures(several, n_permutations=9))
+    made = Structures(several, result=structures(several, n_permutations=9))
     yield made
     made.close()
     assert len(registry._instances) == before
@@ -28,30 +28,30 @@ def test_each_level_has_its_sliders_and_one_is_shown(panel, several):
         panel.level.value = level
         shown = [one for one, view in panel.views.items() if view.layout.display != "none"]
         assert shown == [level]
-        of_level = structures_modes(several, panel.found, level)
+        level_study = structures_modes(several, panel.result, level)
         panel.scores = [2.0, -1.0, 0, 0, 0]
-        expected = s4a.synthesize(of_level, [2.0, -1.0])["position"].values
+        expected = s4a.synthesize(level_study, [2.0, -1.0])["position"].values
         np.testing.assert_allclose(panel.vertices(), expected, atol=1e-4)
     assert "% of the variance" in panel.level.options[1][0]
 
 
 def test_structures_are_hidden_and_coloured(panel):
-    of = panel.found["structure_of_vertex"].values
+    structure = panel.result["structure_of_vertex"].values
     view = panel.views["joint"]
     panel.colors["right"].value = "#00ff00"
     own = np.frombuffer(view.own, np.uint8).reshape(-1, 3)
-    assert (own[of == 1] == [0, 255, 0]).all()
-    assert (own[of == 0] == [0x44, 0x77, 0xAA]).all()
+    assert (own[structure == 1] == [0, 255, 0]).all()
+    assert (own[structure == 0] == [0x44, 0x77, 0xAA]).all()
     view.webgl = "no"
     still = view.still
     panel.colors["left"].value = "#000000"
     assert still[1:4] == b"PNG"
     assert view.still != still
-    panel.seen["left"].value = False
+    panel.visible["left"].value = False
     rest = np.frombuffer(view.corner, "<u4").reshape(-1, 3)
     assert len(rest)
-    assert (of[rest] == 1).all()
-    panel.seen["right"].value = False
+    assert (structure[rest] == 1).all()
+    panel.visible["right"].value = False
     assert "tick at least one structure" in panel.message.value
 
 

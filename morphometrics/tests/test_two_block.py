@@ -63,7 +63,7 @@ def test_a_field_that_follows_shape_is_found_with_its_pattern(simulated):
         covariation(simulated, "thickness", n_components=99)
 
 
-def test_fields_of_noise_are_told_to_follow_shape_no_more_often_than_said():
+def test_the_test_of_covariation_keeps_its_level_for_fields_of_noise():
     found = []
     for run in range(100):
         rng = np.random.default_rng([1, run])
@@ -73,7 +73,7 @@ def test_fields_of_noise_are_told_to_follow_shape_no_more_often_than_said():
     assert np.all(np.mean(found, axis=0) < 0.12)  # 0.05 and three standard errors
 
 
-def test_the_command_writes_what_it_found_and_a_page(tmp_path, capsys, study_folder):
+def test_the_command_writes_results_and_a_page(tmp_path, capsys, study_folder):
     folder = shutil.copytree(study_folder, tmp_path / "study")
     study, rng = open_study(folder), np.random.default_rng(0)
     meshes = study["original"].children.items()
