@@ -298,7 +298,7 @@ def test_contents_that_cannot_be_are_refused(file, lie):
 def test_a_file_of_another_version_is_named_and_computed_again(file):
     synthetic.sphere(50).to_netcdf(file, engine="h5netcdf")
     assert not netcdf.is_done(file, "key")
-    with pytest.raises(OSError, match=r"this version of s4a has not written it.*remove it"):
+    with pytest.raises(OSError, match=r"another version of s4a wrote it.*remove it"):
         netcdf.read(file)
 
 
