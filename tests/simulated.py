@@ -32,7 +32,7 @@ def noise(seed, s, size=0.1):
     return size * np.einsum("swx,nw->snx", rng.normal(size=(s, 10, 3)), np.cos(X @ k.T + phase))
 
 
-def with_carried(study, values, unit="mm"):
+def with_transferred(study, values, unit="mm"):
     """The study with a field that is on the template already."""
     field = dataset(transferred_field=values).assign_coords(
         shape=study["registration"]["shape"].values
@@ -56,4 +56,4 @@ def field_study():
     d = noise(1, 20) + score[:, None, None] * X * [0.5, 0, 0]
     values = 0.5 * pattern(2, 20) + 3 + 4.0 * (group == "b")[:, None] * TOP
     values += 0.2 * (age - 9.5)[:, None] * ~TOP + 3 * score[:, None] * HEIGHT
-    return with_carried(study_of(d, group=group, age=age, score=score), values)
+    return with_transferred(study_of(d, group=group, age=age, score=score), values)

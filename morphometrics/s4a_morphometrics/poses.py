@@ -340,10 +340,10 @@ def measure_levels(
     counts = [len(poses.mean) for poses in each]
     return dataset(
         structure_of_vertex=np.repeat(np.arange(len(each)), counts),
-        pose_rotation=np.stack([one.rotation for one in each], axis=1),
-        pose_translation=np.stack([one.translation for one in each], axis=1),
+        pose_rotation=np.stack([poses.rotation for poses in each], axis=1),
+        pose_translation=np.stack([poses.translation for poses in each], axis=1),
         pose_size=size,
-        within_displacement=np.concatenate([one.shape for one in each], 1).astype(np.float32),
+        within_displacement=np.concatenate([poses.shape for poses in each], 1).astype(np.float32),
         level_variance=variance,
         level_share=variance / variance.sum(),
         score=V * np.sqrt(s - 1),
@@ -439,10 +439,10 @@ def structures_of_new(result: xr.Dataset, inserted: xr.DataTree) -> xr.Dataset:
     weights = [area[v] / area[v].sum() for v in vertices]
     size = [np.sqrt(np.einsum("snx,n->s", f**2, a)) for f, a in zip(d, weights, strict=True)]
     new = dataset(
-        pose_rotation=np.stack([one.rotation for one in each], axis=1),
-        pose_translation=np.stack([one.translation for one in each], axis=1),
+        pose_rotation=np.stack([poses.rotation for poses in each], axis=1),
+        pose_translation=np.stack([poses.translation for poses in each], axis=1),
         pose_size=np.stack(size, axis=1),
-        within_displacement=np.concatenate([one.shape for one in each], 1).astype(np.float32),
+        within_displacement=np.concatenate([poses.shape for poses in each], 1).astype(np.float32),
     )
     mesh = result[["position", "corner_vertex", "vertex_area", "structure_of_vertex"]]
     mesh = mesh.drop_vars(["shape", "level"], errors="ignore")

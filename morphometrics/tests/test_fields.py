@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from simulated import TOP, field_study, with_carried
+from simulated import TOP, field_study, with_transferred
 
 import s4a
 from s4a import cli, open_study, statistics, verify
@@ -176,7 +176,7 @@ def test_vertices_and_shapes_without_a_field_are_left_out_and_reported(simulated
     values = simulated["fields/thickness/transferred_field"].values.copy()
     values[3, :5] = np.nan
     values[7] = np.nan
-    holed = with_carried(simulated, values)
+    holed = with_transferred(simulated, values)
     where = field_group_map(holed, "thickness", "group", n_permutations=99)
     assert "is missing in some shape at 5 of" in caplog.text
     assert "field 'thickness' has no value for 1 of 20 shapes" in caplog.text
@@ -185,7 +185,7 @@ def test_vertices_and_shapes_without_a_field_are_left_out_and_reported(simulated
     assert np.isfinite(where["p_family_wise"].values[5:]).all()
     with pytest.raises(ValueError, match=r"no field 'curv'; it has thickness"):
         field_group_map(simulated, "curv", "group")
-    same = with_carried(simulated, np.ones_like(values))
+    same = with_transferred(simulated, np.ones_like(values))
     with pytest.raises(ValueError, match="the same in all shapes: no variation to test"):
         field_group_map(same, "thickness", "group")
 

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from scipy import optimize
-from simulated import TOP, noise, study_of, with_carried
+from simulated import TOP, noise, study_of, with_transferred
 
 from s4a import cli, open_study, statistics
 from s4a.analysis.permutation import Model
@@ -118,7 +118,7 @@ def test_the_trajectory_is_the_mean_shape_at_each_time_and_a_mode_that_plays(sim
 
 def test_a_field_grows_too(simulated):
     values = noise(5, 24, size=0.1)[..., 0] + 0.4 * AGE[:, None] * TOP
-    study = with_carried(simulated, values)
+    study = with_transferred(simulated, values)
     fit = growth(study, "age", "person", field="thickness", n_permutations=199)
     assert np.allclose(fit["field_effect"].values[TOP], 0.4, atol=0.1)
     assert np.allclose(fit["field_within_effect"].values[TOP], 0.4, atol=0.1)
@@ -172,7 +172,7 @@ def test_single_visits_are_refused_or_reported(simulated, caplog):
     options = {"n_permutations": 99}
     with pytest.raises(ValueError, match="two subjects with visits at different times, found 0"):
         growth(simulated, "age", [f"q{i}" for i in range(24)], **options)
-    with pytest.raises(ValueError, match="needs a time of numbers, found text such as 'f'"):
+    with pytest.raises(ValueError, match="needs a time of numbers; found text such as 'f'"):
         growth(simulated, "sex", "person", **options)
     with pytest.raises(ValueError, match="24 shapes"):
         growth(simulated, "age", ["a", "b"], **options)
