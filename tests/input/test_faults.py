@@ -232,7 +232,7 @@ def test_files_of_different_units_are_told():
     meshes["shape_1"].attrs |= {"unit": "m", "coordinate_system": "LPS"}
     remarks = read_shapes(meshes)["report"].attrs["remarks"]
     assert (
-        "the files name different units, and none was converted (m: shape_1; mm: shape_0)"
+        "the files have different units, and none was converted (m: shape_1; mm: shape_0)"
         in remarks
     )
     assert (
@@ -246,7 +246,7 @@ def test_of_two_mirror_images_none_is_the_right_one():
     report = read_shapes({"a": (X, T), "b": (X * [1, -1, 1], T)})["report"].to_dataset()
     assert report["warning"].values.tolist() == ["", ""]
     assert (
-        "mirror images of each other, by ICP: a and b; kept as they are" in report.attrs["remarks"]
+        "mirror images of each other, by ICP: a and b; none was changed" in report.attrs["remarks"]
     )
 
 
@@ -293,7 +293,7 @@ def test_a_wrong_registration_is_told():
     wrong, remarks = flagged({"a": 0.0, "b": 0.02, "c": 0.1})
     assert list(wrong) == ["c"]
     assert [(one.kind, one.flagged) for one in wrong["c"]] == [("registration", True)]
-    assert "registration_error 0.100" in wrong["c"][0].words
+    assert "registered wrongly (0.100)" in wrong["c"][0].words
     assert remarks == []
     assert flagged({"a": 0.0, "b": 0.12, "c": 0.1})[0] == {}
 
