@@ -101,16 +101,17 @@ READINGS = [
     Reading(
         "4.1, step 2",
         "ICP",
-        "point to point, in both directions, without the farthest tenth of the pairs, starting "
-        "from the given pose, from rotations of the principal axes and tilted; to a reference, "
-        "then again for each pair",
+        "point to point, in both directions, trimmed by a tenth of the pairs, from several "
+        "initial rotations (the given pose, alignments of the principal axes, tilted ones); to a "
+        "reference first, then again for each pair",
         "ICP from the given pose only (no option)",
         ("ICP from one start",),
     ),
     Reading(
         "4.1, step 4",
         "a map is optimised with landmarks; the code is based on pyFM",
-        "heat kernels around the landmarks at 8 times, and $C$ commutes with the Laplacians",
+        "heat kernels around the landmarks at 8 times, with a penalty for a map that does not "
+        "commute with the Laplacians",
         "pyFM's fit: wave kernels of the shapes and around the landmarks (no option)",
         ("initial maps of pyFM",),
     ),
@@ -258,8 +259,8 @@ Each other reading on top of the paper:
 
 **The norm of eq. 5.** The paper writes the norm of the Sobolev space $H_0^2$, in which $\\lVert f
 \\rVert = \\lVert \\Lambda^0 f \\rVert$ with the eigenvalues $\\Lambda^0$ of the limit shape. It
-does not say between which spaces $D_i - I$ is an operator. `norm` has five readings. The choice
-decides which shape is the median, and therefore the template, and nothing else. Errors are those
+does not say between which spaces $D_i - I$ is an operator. `norm` offers five interpretations.
+The choice decides which shape is the median, and therefore the template, and nothing else. Errors are those
 of the registration to that median.
 
 {norms}

@@ -248,7 +248,7 @@ class Options:
 
     # fmt: off
     preset: str | None = computing(None,
-        "'paper' switches off everything that S4A adds to the paper; 'fast' halves the time",
+        "'paper' switches off all additions to the published method; 'fast' halves the time",
         choices=("paper", "fast"), pair=True,
         more="Errors of 'fast' are about a tenth larger (``benchmarks/cheaper.py``).  A value that "
         "contradicts the preset is refused; to add one thing to the paper, pass "
@@ -263,8 +263,8 @@ class Options:
         "exclude shapes with non-finite vertices instead of repairing them", of="cleaning")
     close_holes: bool = reading(False, "close each hole with a fan of triangles", of="cleaning")
     label: int | str | None = reading(None,
-        "the files are label volumes (NIfTI, MGH): extract the surface of this label, or of "
-        "several (1,2)",
+        "the files are label volumes (NIfTI, MGH): extract the surface of this label, or of the "
+        "union of several (1,2)",
         check=check_label, of="cleaning", more='Or of ``"all"``, see :func:`s4a.read_labels`')
     reflect: str | list[str] | None = reading(None,
         "shapes to mirror: names separated by commas, COLUMN=VALUE of the table, or 'auto'",
@@ -282,9 +282,9 @@ class Options:
         more="3D Slicer (.mrk.json), CSV or MeshLab (.pp), for all shapes or some.  Landmarks of "
         "the same name attract each other, see :func:`s4a.with_landmarks` for meshes in memory")
     features: str | list[str] | None = reading(None,
-        "scalar fields that guide registration, separated by commas: sulc is a.sulc.npy next to "
-        "a.ply",
-        more="Or a.sulc, or a PLY property (:func:`s4a.input.annotations.feature_files`); see "
+        "scalar fields that guide registration, separated by commas: sulc is read from "
+        "a.sulc.npy next to a.ply",
+        more="Or from a.sulc, or a PLY property (:func:`s4a.input.annotations.feature_files`); see "
         ":func:`s4a.with_features` for meshes in memory")
     method: str = network("rematch",
         "low resolution by remeshing (ReMatching) or by the local functions of SCALABLE",
@@ -295,8 +295,7 @@ class Options:
         "``refined_eigenfunctions`` and ``wrap`` need a coarse mesh and are refused")
     n_coarse: int = network(N_COARSE, "number of vertices of the low-resolution meshes", least=100,
         fast=3000, section="4.1", of="low resolution", pair=True,
-        more="Or of samples with SCALABLE.  The meshes can have a few percent fewer or more "
-        "vertices")
+        more="With SCALABLE, the number of samples.  The meshes have between 95 and 110 % of it")
     wrap: bool = network(False, "wrap the shapes in a watertight surface before remeshing",
         of="low resolution")
     refined_eigenfunctions: bool = network(False,
@@ -325,14 +324,14 @@ class Options:
         instead="one ZoomOut iteration before Consistent ZoomOut", see="method/initial_map",
         of="initial maps", given_as="never".__ne__, pair=True,
         more="The iteration keeps the size of the map.  Single pairs are matched as in 4.1")
-    step: int = network(5, "growth of the maps in each iteration of Consistent ZoomOut", least=1,
+    step: int = network(5, "eigenfunctions added in each iteration of Consistent ZoomOut", least=1,
         section="4.2", pair=True)
     n_latent: int | None = network(None, "dimension of the latent space; by default k", least=2,
         section="eq. 3")
     weights: str = network("cycles", "weights of the maps: from their cycle errors, or all 1",
         choices=("cycles", "equal"), section="eq. 3", see="method/network")
     n_samples: int = network(N_SAMPLES,
-        "farthest-point samples at which the network searches matches; 0 means all vertices",
+        "farthest-point samples for which Consistent ZoomOut searches matches; 0: all vertices",
         paper=0, fast=500, section="eq. 3", instead="for all vertices in every iteration",
         see="method/latent", of="initial maps",
         more="Also used by the initial refinement where pose differences are small.  At least 2 k")
@@ -352,7 +351,7 @@ class Options:
         choices=("latent", "fmap"), section="4.2",
         more='Unless ``refine="intrinsic"``, this match is one of several initialisations')
     refine: str = registration("elastic",
-        "elastic iterations, iterated spectral non-rigid ICP, or the match of the paper alone",
+        "elastic iterations, iterated spectral non-rigid ICP, or no refinement as in the paper",
         choices=("elastic", "spectral_icp", "intrinsic"), paper="intrinsic", section="eq. 7, 4",
         instead="the match as it is", see="method/elastic", of="registration", pair=True,
         more="Elastic iterations penalise bending and stretch; where poses differ a lot, spectral "
@@ -382,15 +381,15 @@ class Options:
         "vertices, near coarse ones, used for that projection; 0 means all", paper=0,
         section="after eq. 8", instead="on all vertices", see="method/shape", of="projection",
         pair=True)
-    remove_size: bool = registration(False, "remove size from the displacements",
-        of="registration")
+    remove_size: bool = registration(False, "align with scaling, so that displacements do not contain "
+        "size", of="registration")
     intersections: bool = quality(True, "count triangles that intersect others")
     quality_control: str = quality("exclude",
         "flagged shapes are excluded from the network, or the run stops",
         choices=("exclude", "stop"),
-        more="Mirrored shapes and shapes in another unit are examples.  An excluded shape is "
-        "mapped to the network of the others and registered, so that it does not change their "
-        "results.  With 'stop' the run ends before the long stages")
+        more="A flagged shape, such as a mirrored one or one in another unit, is left out of the "
+        "network and of the modes.  It is registered afterwards, with the results of the others "
+        "held fixed.  With 'stop' the run ends before the long stages")
     include_flagged: bool = quality(False, "include flagged shapes in the modes and statistics")
     # fmt: on
 

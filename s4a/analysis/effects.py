@@ -49,8 +49,10 @@ def group_test(
 ) -> xr.Dataset:
     """Test whether the mean shapes of groups differ: permutation Hotelling T^2 test of the scores.
 
-    The null hypothesis is that the groups have the same mean.  The covariance is shrunk after
-    Ledoit and Wolf (2004).
+    With ``variances="equal"`` the null hypothesis is that the distribution of shape, given the
+    covariates, is the same in all groups; with ``"unequal"``, that the means are equal and the
+    errors symmetric about zero.  The covariance is shrunk (Ledoit and Wolf 2004).  For more than
+    two groups the statistic is the Lawley-Hotelling trace.
 
     Parameters
     ----------
@@ -58,11 +60,13 @@ def group_test(
     group : array_like (shape,), dict of shape to value, or name in /subjects
     covariates : as `group`, a dict of name to these, or an array_like (shape, covariate)
         Or a list of names in /subjects: confounders to adjust for (Freedman and Lane 1983).  Text
-        becomes indicators of its values.  Shapes without a value are excluded, with a warning.
+        is dummy-coded.  Shapes without a value are excluded, with a warning.
     n_components : int, optional
-        By default the components of 90 % of the variance, at most half of the number of shapes.
+        By default as many components as explain 90 % of the variance, at most half of the number of
+        shapes.
     n_permutations : int
-        If there are fewer distinct permutations, each is used once, and p is exact.
+        If there are fewer distinct permutations, each is used once.  With covariates the test is
+        approximate.
     variances : {"equal", "unequal"}
         Permute shapes, which assumes homogeneous covariance; or flip signs of the residuals, which
         allows groups of different covariance and assumes symmetric errors.
@@ -72,7 +76,7 @@ def group_test(
     -------
     Dataset
         ``statistic``, ``p_value``; attributes ``groups`` (sizes), ``components``, ``permutations``,
-        ``smallest_p`` that these can reach, ``covariates`` in words, and the excluded shapes
+        ``smallest_p``, the smallest attainable p, ``covariates`` in words, and the excluded shapes
         ``left_out``.
 
     Raises
@@ -225,9 +229,9 @@ def regression(
         The global test, ``statistic`` and ``p_value``, see :func:`group_test`; the test at every
         vertex, see :func:`group_map`; ``effect(vertex, xyz)`` per unit of the variable,
         ``effect_size`` = Cohen's f, and ``intercept(vertex, xyz)``; ``standard_score(shape)`` of
-        the variable.  Attributes ``mean``,
-        ``standard_deviation``, ``lowest`` and ``highest`` of the variable, ``freed_deviation``, its
-        standard deviation adjusted for the covariates, and those of :func:`group_test`.
+        the variable.  Attributes ``mean``, ``standard_deviation``, ``lowest`` and ``highest`` of
+        the variable, ``freed_deviation``, its standard deviation adjusted for the covariates, and
+        those of :func:`group_test`.
 
     Raises
     ------

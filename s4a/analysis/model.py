@@ -355,12 +355,13 @@ def evaluate(
     Returns
     -------
     Dataset
-        ``compactness(component)`` = sum of the variances, standard error sqrt(2 / s) times it
-        (Davies 2002); ``generalization(component)``, leave-one-out with the correspondences kept,
-        therefore optimistic (:func:`s4a.analysis.statistics.generalization` recomputes them), NaN
-        for the last component; ``specificity(component)``; each with its standard error, as root
-        mean square over the area between vertices, and ``_surface`` as mean distance from points to
-        the surface, all in the unit of the input; ``variance_ratio``, ``variance_ratio_null``,
+        ``compactness(component)``, cumulative variance of the first components, with the standard
+        error sqrt(2 / s) times it for s shapes (Davies 2002).  ``generalization(component)``,
+        leave-one-out reconstruction error, NaN for the last component; the correspondences are not
+        recomputed, so it is optimistic.  ``specificity(component)``, distance of random shapes to
+        the nearest shape.  The last two are area-weighted root mean square vertex distances, those
+        ending in ``_surface`` mean point-to-surface distances, in the unit of the input, each with
+        its standard error.  ``variance_ratio``, ``variance_ratio_null``,
         ``variance_ratio_null_95``.  The attribute ``generalization_0`` is that of the mean shape
         alone.
 

@@ -368,8 +368,8 @@ CLOSE = 2.0  # times the usual residual; a part is not a mirror image
 KINDS = {
     "dropped": (False, "dropped components had {percent:.0f} % of the area; "
         'components=N or "all" keeps more', "--components all keeps more of them"),
-    "unit": (True, "{ratio:.3g} times the size of the others, near {unit}: another unit, such as "
-        "mm for m? The size was not changed; scale the file if that is wrong",
+    "unit": (True, "{ratio:.3g} times the size of the others, near {unit}: are its "
+        "coordinates in another unit? The size was not changed; scale the file if that is wrong",
         "scale the files to the unit of the others"),
     "size": (False, "{ratio:.3g} times the size of the others; the size was not changed; scale the "
         "file if that is wrong", "scale the files if their size is wrong"),
@@ -383,16 +383,16 @@ KINDS = {
     "mirrored": (True, "fits as a mirror image (median ICP residual {fit:.3f} as it is, "
         "{fit_mirrored:.3f} reflected): left and right exchanged? It was not changed; reflect= "
         "mirrors it", "--reflect mirrors them, if left and right are exchanged"),
-    "partial": (True, "the holes are {value:.2g} of sqrt(area) long, of the others {usual:.2g}: is "
-        "a part missing? Complete the scan, remove it, or use close_holes=True if it only has "
-        "holes", "scan again, or remove the files"),
+    "partial": (True, "its boundary loops have a length of {value:.2g} sqrt(area), those of the "
+        "others {usual:.2g}: is a part missing? Complete or remove the scan; if these are only "
+        "holes, use close_holes=True", "scan again, or remove the files"),
     "spacing": (False, "coordinates are rounded to {value:.2f} of an edge (others {usual:.2f}); "
         "export the file with more digits", "export the files with more digits"),
-    "kind": (False, "unlike the others: {what} {deviations:.0f} times the usual deviation away; "
-        "another kind of shape, stretched, or a part? Remove it if it does not belong to the "
-        "collection", "remove the files if they are of another kind"),
-    "registration": (True, "{sure} registered wrongly ({registration_error:.3f}{distortion}): "
-        "look at it in s4a view, compare its file with the template's, or remove it",
+    "kind": (False, "outlier: {what} {deviations:.0f} robust deviations from the median; is it "
+        " another kind of shape, stretched, or only a part? Remove it if it does not belong "
+        "to the collection", "remove the files if they are of another kind"),
+    "registration": (True, "registration {sure} (score {registration_error:.3f}{distortion}): "
+        "inspect it with s4a view, compare its file with the template's, or remove it",
         "look at the page; a larger --n-coarse may help"),
 }
 # fmt: on
@@ -611,8 +611,8 @@ def _forms(comparisons, flags):
     # poses change the extents most, so their limit is higher
     extents = np.abs(excess(np.array(moment).T, MOMENT)).max(1) * WARNED / _WARNED_EXTENT
     scores = {
-        "its distance from them after alignment is": excess(fit, _FIT),
-        "its volume for its area is": np.abs(excess(compactness, COMPACTNESS)),
+        "its distance from the others after alignment is": excess(fit, _FIT),
+        "its volume-to-area ratio is": np.abs(excess(compactness, COMPACTNESS)),
         "its extents are": extents,
     }
     for i, name in enumerate(comparisons):

@@ -84,20 +84,21 @@ def analyse(
 ) -> xr.DataTree:
     """Analyse a collection of meshes: median shape, dense correspondences, modes of variation.
 
-    The steps are those of the paper, with elastic iterations added by default.
+    The steps are those of Maccarone et al. with several additions, mainly elastic registration;
+    ``preset="paper"`` switches all additions off.
 
     Parameters
     ----------
     shapes : path, list of paths, dict or xarray.DataTree
-        A folder, a glob, files, a dict of name to a file, a Dataset or (points, triangles), or what
-        :func:`s4a.read_shapes` returns.
+        A folder, a glob pattern or a list of files; a dict from names to files, Datasets or
+        ``(points, triangles)``; or the tree that :func:`s4a.read_shapes` returns.
     preset, n_coarse, n_pairs, k, label, reflect, table, landmarks, template, remove_size
         The most used options, see :class:`s4a.Options`.  None means the value of `options`, or the
         default.
     options : Options, optional
         Options that replace the defaults.
     **others
-        Every other option of :class:`s4a.Options`; ``rng`` for ``seed``.
+        All other options of :class:`s4a.Options`.  ``rng`` can replace ``seed``.
     store : path, optional
         Folder of the study.  A run that was interrupted resumes at the first missing file.
     n_jobs : int, optional
@@ -112,7 +113,7 @@ def analyse(
     Raises
     ------
     ValueError
-        If an option is out of range, or fewer than 2 shapes can be used; the message has the
+        If an option is out of range, or fewer than 2 shapes can be used; the message gives the
         reasons.  With ``quality_control="stop"``, if a shape is flagged.
     TypeError
         If an option does not exist.

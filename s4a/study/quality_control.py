@@ -135,8 +135,8 @@ def exclude_flagged(
         flags = {n: [flag._replace(flagged=False) for flag in flags.get(n, [])] for n in flags}
         if len(coarse) > 1:
             remarks = [
-                f"{len(coarse) - len(trusted)} of {len(coarse)} shapes are flagged, and fewer than "
-                "two are not: all shapes are used"
+                f"{len(coarse) - len(trusted)} of {len(coarse)} shapes are flagged, too many to "
+                "exclude them; all shapes are used"
             ]
         trusted = list(coarse)
     k = usable_k([count[n] for n in trusted], options.k)
@@ -241,7 +241,7 @@ def flagged(
     for name, score in registration_error.items():
         if name not in wrong and product[name] <= warning_limit:
             continue
-        sure = "probably" if name in wrong else "possibly, in parts,"
+        sure = "probably wrong" if name in wrong else "possibly wrong in parts"
         mean = f", mean |distortion| {distortion[name]:.2f}" if name in distortion else ""
         values = {"sure": sure, "registration_error": score, "distortion": mean}
         flags[name] = [flag("registration", name in wrong, **values)]

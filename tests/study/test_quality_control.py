@@ -154,7 +154,7 @@ def test_panels_and_page_mark_flagged_shapes(study):
         tabs[title]
     texts = [text for text, _ in tabs["Correspondence"].choice.options]
     assert {"a_metre (flagged)", "brain_02"} <= set(texts)
-    assert "beside it, flagged: a_metre, z_inch" in tabs["Network"].facts.value
+    assert "excluded (flagged): a_metre, z_inch" in tabs["Network"].facts.value
     tabs["Correspondence"].map.value = "low"
     tabs["Correspondence"].shape = "z_inch"
     assert not tabs["Correspondence"].failed
