@@ -32,7 +32,7 @@ BEAN = bean(U)
 AREA = vertex_areas(BEAN, T)
 APART = np.array([[-16.0, 0, 0], [16, 0, 0]])
 N_PERMUTATIONS = 99
-PLANTED = {"poses": (1, 0), "shapes": (0, 1), "both": (1, 1), "neither": (0, 0)}
+SIMULATED = {"poses": (1, 0), "shapes": (0, 1), "both": (1, 1), "neither": (0, 0)}
 HEAD = ["", "error, poses", "error, shapes", "error, together"]
 HEAD += ["power, poses", "power, shapes", "power, together"]
 
@@ -73,7 +73,7 @@ def shares(runs: int) -> None:
     """The table of simulated variation."""
     head = ["simulated", "variance, mm²", "between, %", "within, %", "runs differ by, %"]
     sys.stdout.write(f"| {' | '.join(head)} |\n|{' --- |' * len(head)}\n")
-    for name, (pose, shape) in PLANTED.items():
+    for name, (pose, shape) in SIMULATED.items():
         found = []
         for run in range(runs):
             Y = draw(np.random.default_rng([run, pose, shape]), 12, pose, shape)
@@ -115,7 +115,7 @@ def registered() -> None:
     logging.disable(logging.WARNING)  # so few and small shapes look flagged now and then
     head = ["simulated", "between, %", "of the truth, %", "variance, mm²", "of the truth, mm²"]
     sys.stdout.write(f"| {' | '.join(head)} |\n|{' --- |' * len(head)}\n")
-    for name, (pose, shape) in PLANTED.items():
+    for name, (pose, shape) in SIMULATED.items():
         made = subjects(8, 600, pose=pose, shape=shape)
         study = s4a_morphometrics.analyse_structures(made, n_coarse=400, k=24, k_init=10, n_jobs=1)
         found = s4a_morphometrics.structures(study, n_permutations=1)
