@@ -440,7 +440,7 @@ def groups():
     )
     where = statistics.group_map(study, group)
     u = truth[study["registration"].attrs["template"]]["reference_point"].values
-    part = [truth[f"planted_{v}"].values for v in ("centre", "width", "push", "turn")]
+    part = [truth[f"simulated_{v}"].values for v in ("centre", "width", "push", "turn")]
     field = synthetic._fields(synthetic.reference_brain(u), *part[:2], part[2][1], part[3][1])
     size = np.linalg.norm(field, axis=1)
     region = size > 0.25 * size.max()

@@ -36,7 +36,7 @@ from s4a_morphometrics.bilateral import antisymmetry_test, matching_sides, sides
 from s4a_morphometrics.bilateral_pairs import involution
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
-N_VERTICES, N_EFFECT = 40, 4
+N_VERTICES, N_SIMULATED = 40, 4
 N_PERMUTATIONS = 99
 EFFECT = 1.2  # directional asymmetry at a vertex, in standard deviations of what fluctuates
 HUMPS = 2.0  # of an antisymmetry, in standard deviations around each
@@ -71,7 +71,7 @@ def found(a: np.ndarray, run: int, *, simulated: bool) -> list[float]:
     model = Model.one_sample(len(a), N_PERMUTATIONS, run)
     p_max = model.vertex_test(a)[2]
     rows = a[..., 0]
-    at = (p_max[:N_EFFECT] <= 0.05).mean() if simulated else p_max.min() <= 0.05
+    at = (p_max[:N_SIMULATED] <= 0.05).mean() if simulated else p_max.min() <= 0.05
     whole = sides_test(rows @ rows.T, model)[1] <= 0.05
     return [at, whole]
 
@@ -92,9 +92,9 @@ def rates(n: int, kind: str, runs: int) -> np.ndarray:
         if run % 5:
             continue
         shifted = a.copy()
-        shifted[:, :N_EFFECT] += EFFECT
+        shifted[:, :N_SIMULATED] += EFFECT
         said[run, 3:5] = found(shifted, run, simulated=True)
-        a[:, : 2 * N_EFFECT, 0] += HUMPS * rng.choice([-1, 1], n)[:, None]
+        a[:, : 2 * N_SIMULATED, 0] += HUMPS * rng.choice([-1, 1], n)[:, None]
         said[run, 5] = antisymmetric(a[..., 0], run)
     return np.nanmean(said, axis=0)
 

@@ -1,10 +1,10 @@
-"""What no other benchmark prints of the paper's claims: figures of ``docs/claims.md``.
+"""Figures of ``docs/claims.md`` that no other benchmark measures.
 
-``claims.py [remesh] [swaps] [discretization] [transfer] [--data FOLDER]``: what a low resolution
-loses (4.1), exchanged eigenfunctions in initial maps (Fig. 2), the same shapes in other vertices
-(4.2), and both ways of a transfer (6.2).  Heads and faces are those of the shared data beside the
-checkout, or in a folder that ``--data`` names, a folder of PLY files for each set; without them
-these rows are left out.
+``claims.py [remesh] [swaps] [discretization] [transfer] [--data FOLDER]``: error of a low
+resolution (4.1), exchanged eigenfunctions in initial maps (Fig. 2), the same shapes with other
+vertices (4.2), and both algorithms of a transfer (6.2).  Heads and faces are read from the shared
+data next to the checkout, or from ``--data``, with a folder of PLY files for each set; without them
+their rows are omitted.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.options import Options
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
-K = 50  # eigenfunctions that are compared
+K = 50  # number of eigenfunctions that are compared
 PRESETS = ("paper", None)
 
 
@@ -36,7 +36,7 @@ def say(text):
 
 
 def files_of(name, folder, given):
-    """The PLY files of a set of the real data; none where these are absent."""
+    """Return the PLY files of a set of real data, an empty list without data."""
     if given is None and DATA.is_dir():
         command = [sys.executable, DATA / "unpack.py", folder, name]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
@@ -44,7 +44,7 @@ def files_of(name, folder, given):
 
 
 def remesh(given):
-    """Vertices, surface, eigenvalues and eigenfunctions of a low resolution of 6,000 vertices."""
+    """Print errors of surface, eigenvalues and eigenfunctions after remeshing to 6,000 vertices."""
     meshes = {"synthetic brain": synthetic.brains(1, 100_000)["original/brain_01"].to_dataset()}
     with tempfile.TemporaryDirectory() as folder:
         for name, count in (("heads", 2), ("faces", 1)):
@@ -65,25 +65,25 @@ def remesh(given):
         off = distance_to_surface(X, *as_arrays(low))
         area = vertex_areas(X, T)
         size = np.sqrt(area.sum())
-        found, true = coarse.low.eigenvalue[1:K], dense.eigenvalue[1:K]
+        approximate, true = coarse.low.eigenvalue[1:K], dense.eigenvalue[1:K]
         say(
             f"{name:24} {len(X):9} {100 * (1 - low.sizes['vertex'] / len(X)):7.1f} % "
             f"{100 * area @ off / area.sum() / size:10.3f} % "
-            f"{100 * np.abs(found / true - 1).mean():10.2f} % {100 * lost:18.2f} %"
+            f"{100 * np.abs(approximate / true - 1).mean():10.2f} % {100 * lost:18.2f} %"
         )
 
 
 def lost_share(dense, F):
-    """RMS part of the first K eigenfunctions of the mesh that is not in the span of F."""
+    """Return the RMS residual of the first K eigenfunctions of the mesh in the span of F."""
     root = np.sqrt(dense.area)[:, None]
     Q = np.linalg.qr(root * F)[0]
     Phi = root * dense.Phi[:, :K]
-    left = Phi - Q @ (Q.T @ Phi)
-    return float(np.sqrt((left**2).sum(0)).mean())
+    residual = Phi - Q @ (Q.T @ Phi)
+    return float(np.sqrt((residual**2).sum(0)).mean())
 
 
 def swaps(given):
-    """In how many initial maps two of the first four eigenfunctions that vary are exchanged."""
+    """Count the initial maps that exchange two of the first four non-constant eigenfunctions."""
     collections = {"six synthetic brains": synthetic.brains(6, 10_000, 3)}
     with tempfile.TemporaryDirectory() as folder:
         for name, count in (("heads", 6), ("faces", 6)):
@@ -105,13 +105,13 @@ def swaps(given):
 
 
 def discretization(given):
-    """The median shape and eq. 5 of the same six brains in 5,000 to 40,000 vertices (4.2)."""
+    """Print the median shape and eq. 5 of six brains with 5,000 to 40,000 vertices (4.2)."""
     say("\n4.2: eq. 5 of the same six brains, other vertices; 2,000 at low resolution, the paper\n")
     for n_vertices in (5_000, 10_000, 20_000, 40_000):
         shapes = synthetic.brains(6, n_vertices, 3)
         study = s4a.analyse(shapes, n_coarse=2000, preset="paper", n_jobs=1)
         latent = study["latent"]
-        energy = ", ".join(f"{one:.4f}" for one in latent["distance_to_limit"].values)
+        energy = ", ".join(f"{value:.4f}" for value in latent["distance_to_limit"].values)
         say(f"{n_vertices:7} vertices: median {latent.attrs['median']}; {energy}")
 
 
@@ -131,25 +131,25 @@ def transfer(given):
         begin = time.process_time()
         pairs = s4a.register_pairs(outside, meshes, n_coarse=2000, preset=preset, n_jobs=1)
         label = outside["label"].values
-        carried = s4a.transfer_labels(pairs, label)
+        transferred = s4a.transfer_labels(pairs, label)
         seconds = time.process_time() - begin
         points = s4a.transfer_landmarks(pairs, marks)
-        show(f"pair by pair, preset {preset}", carried, points, meshes, seconds)
+        show(f"pair by pair, preset {preset}", transferred, points, meshes, seconds)
         begin = time.process_time()
-        carried = s4a.transfer_labels(study, label, source=outside)
+        transferred = s4a.transfer_labels(study, label, source=outside)
         seconds = time.process_time() - begin
         points = s4a.transfer_landmarks(study, marks, source=outside)
-        show(f"through the median, preset {preset}", carried, points, meshes, seconds)
+        show(f"through the median, preset {preset}", transferred, points, meshes, seconds)
 
 
-def show(name, carried: xr.DataTree, points: xr.DataTree, meshes, seconds):
-    """A row: share of labels that are right, mean distance of landmarks in % of sqrt(area)."""
+def show(name, transferred: xr.DataTree, points: xr.DataTree, meshes, seconds):
+    """Print a row: share of correct labels, mean distance of landmarks in % of sqrt(area)."""
     right, off = [], []
     for shape, mesh in meshes.items():
         size = np.sqrt(vertex_areas(*as_arrays(mesh)).sum())
-        right.append((carried[shape]["label"].values == mesh["label"].values).mean())
-        gap = points[shape]["landmark_position"].values - mesh["landmark_position"].values
-        off.append(np.linalg.norm(gap, axis=1).mean() / size)
+        right.append((transferred[shape]["label"].values == mesh["label"].values).mean())
+        error = points[shape]["landmark_position"].values - mesh["landmark_position"].values
+        off.append(np.linalg.norm(error, axis=1).mean() / size)
     say(f"{name:40} {100 * np.mean(right):11.1f} % {100 * np.mean(off):12.2f} % {seconds:7.1f}")
 
 

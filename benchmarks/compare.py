@@ -326,7 +326,7 @@ def where(source, seen):
         for way in LOOKED_AT:
             one = outcomes[way]
             image = X[one.match] if one.image is None else one.image
-            forth, back = (100 * gap for gap in metrics.gaps(X / size, image / size))
+            forth, back = (100 * gap for gap in metrics.nearest_distances(X / size, image / size))
             near = forth <= FAR_GAP
             cells = [f"{np.quantile(forth, q):.2f}" for q in (0.5, 0.99, 1)]
             cells += [f"{forth.mean():.3f}", f"{forth[near].mean():.3f}", f"{back.mean():.3f}"]

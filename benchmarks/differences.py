@@ -1,4 +1,4 @@
-"""The page ``docs/differences.md``: its text here, its figures from ``docs/differences.csv``.
+"""Generate ``docs/differences.md`` from the text below and figures in ``docs/differences.csv``.
 
 ``differences.py`` prints it, ``differences.py --write`` writes it.  The figures are measured by
 ``additions.py --write``.
@@ -20,12 +20,12 @@ PAGE = DOCS / "differences.md"
 HEAD = ["set", "row", "matched", "surface", "carried", "seconds", "template"]
 SETS = ("brains", "faces", "bodies")
 SWITCH = ["equation", "in the paper", "in S4A", "where", "option: default, in the paper"]
-LACKING = "not yet"  # in the place of a figure that was not measured
+LACKING = "not yet"  # instead of a figure that was not measured
 
 
-# additions that are another value of an option than its default, and rows of their own
+# additions that are another value of an option than its default, with rows of their own
 OTHER = {"spectral_icp": "refine"}
-MORE = {  # what the table also says of a value
+MORE = {  # notes of the table on a value
     "refined_eigenfunctions": "; `RE-MATCH refined` of `s4a.compare`: True",
     "full_resolution_iterations": "; `RE-MATCH refined` of `s4a.compare`: 2",
     "n_samples": ", all",
@@ -34,14 +34,14 @@ MORE = {  # what the table also says of a value
 
 
 class Reading(NamedTuple):
-    """What the paper leaves open, or does by other code, and what is done here."""
+    """An open point of the paper, or a step by other code, and its implementation here."""
 
     equation: str
     paper: str
     here: str
-    other: str  # the option or the function that is put in its place
-    rows: tuple[str, ...]  # of the results, measured on the paper; or none
-    effect: str = ""  # where nothing is measured
+    other: str  # option or function of another reading
+    rows: tuple[str, ...]  # rows of the results, if measured
+    effect: str = ""  # if not measured
 
 
 READINGS = [
@@ -295,7 +295,7 @@ PAIRS = {
 
 
 def results():
-    """The rows of the results by set and name."""
+    """Return the rows of the results by set and name."""
     if not RESULTS.is_file():
         return {}
     with RESULTS.open(encoding="utf-8", newline="") as file:
@@ -303,35 +303,35 @@ def results():
 
 
 def keep(which, row, cells):
-    """Put a row into the results, in the place of the one that it had."""
-    found = results()
-    found[which, row] = dict(zip(HEAD, [which, row, *cells], strict=True))
+    """Add or replace a row of the results."""
+    rows = results()
+    rows[which, row] = dict(zip(HEAD, [which, row, *cells], strict=True))
     with RESULTS.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, HEAD, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(found.values())
+        writer.writerows(rows.values())
 
 
 def figure(found, which, row, column):
-    """A figure of the results, or that there is none."""
+    """Return a figure of the results, or ``LACKING``."""
     return found[which, row][column] if (which, row) in found else LACKING
 
 
 def both_errors(found, which, row):
-    """Errors of the matches and of the surface in one cell."""
+    """Return the errors of matches and surface in one cell."""
     if (which, row) not in found:
         return LACKING
     return f"{found[which, row]['matched']}, {found[which, row]['surface']}"
 
 
 def table(head, rows):
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def measured(found, rows, columns=("matched", "surface", "seconds")):
-    """A table of these rows (name in the results -> name on the page), three columns a set."""
+    """Return a table of rows (name in the results -> name on the page), three columns a set."""
     short = {"matched": "", "surface": "", "carried": "transferred", "seconds": "CPU s"}
     head = [""]
     for which in SETS:
@@ -344,7 +344,7 @@ def measured(found, rows, columns=("matched", "surface", "seconds")):
 
 
 def errors_of(found, rows):
-    """The same with both errors in one cell."""
+    """Return the same table with both errors in one cell."""
     head = ["", *(f"{which}{what}" for which in SETS for what in ("", ", CPU s"))]
     cells = []
     for row, name in rows.items():
@@ -356,16 +356,18 @@ def errors_of(found, rows):
 
 
 def summary(found):
-    """What the additions do on each set, in words made from the figures."""
+    """Describe the effect of the additions on each set."""
     lines = []
     single = additions()
     for which in SETS:
-        of = {row: float(line["surface"]) for (one, row), line in found.items() if one == which}
-        if not {"paper", "default"} <= set(of):
+        errors = {
+            row: float(line["surface"]) for (name, row), line in found.items() if name == which
+        }
+        if not {"paper", "default"} <= set(errors):
             lines.append(f"- *{which}*: {LACKING} measured.")
             continue
-        paper, default = of["paper"], of["default"]
-        times = {row: of[row] / paper for row in single if row in of}
+        paper, default = errors["paper"], errors["default"]
+        times = {row: errors[row] / paper for row in single if row in errors}
         best, worst = min(times, key=times.get), max(times, key=times.get)
         seconds = [float(found[which, row]["seconds"]) for row in ("paper", "default")]
         verdict = "more accurate" if default < paper else "**less accurate**"
@@ -382,28 +384,28 @@ def summary(found):
 
 
 def additions():
-    """The rows of the results in which one thing alone is added to the paper, and their names."""
+    """Return the rows of the results with one addition to the paper, and their names."""
     rows = {f"paper, {value}": f'`{option}="{value}"`' for value, option in OTHER.items()}
     return {f"paper, {option}": f"`{option}`" for option in PAPER} | rows
 
 
 def line_of(name):
-    """The line of the table of an option that the preset of the paper sets, as it is declared."""
-    told = DECLARED[name].metadata
-    text = told["help"] if not told["more"] else f"{told['help']}. {told['more']}"
+    """Return the row of the table for an option that the preset of the paper sets."""
+    declared = DECLARED[name].metadata
+    text = declared["help"] if not declared["more"] else f"{declared['help']}. {declared['more']}"
     text = re.sub(r"``|:\w+:(?=`)", lambda mark: "`" if mark[0] == "``" else "", text)
-    where = f"`{told['see']}`"
+    where = f"`{declared['see']}`"
     values = f"`{name}`: {quoted(DEFAULTS[name])}, {quoted(PAPER[name])}{MORE.get(name, '')}"
-    return [told["section"], told["instead"], text, where, values]
+    return [declared["section"], declared["instead"], text, where, values]
 
 
 def quoted(value):
-    """A value as it is written in Python."""
+    """Return a value in Python notation."""
     return f'"{value}"' if isinstance(value, str) else str(value)
 
 
 def page(found):
-    """The page."""
+    """Return the text of the page."""
     rows = {"paper": "the paper alone"}
     rows |= {
         row: f"and {name}"

@@ -18,7 +18,7 @@ import numpy as np
 from s4a.analysis.permutation import Model
 from s4a_morphometrics.longitudinal import random_intercepts, within_subjects
 
-N_VERTICES, N_EFFECT, N_PERMUTATIONS = 40, 4, 99
+N_VERTICES, N_SIMULATED, N_PERMUTATIONS = 40, 4, 99
 EFFECT = 0.6  # slope per standard deviation of time within subjects, in those of the residuals
 HEAD = [
     "", "visits: error, vertices", "error, whole", "power, vertices", "power, whole",
@@ -57,7 +57,7 @@ def draw(run: int, setting: tuple[int, str, str], effect: float) -> tuple[np.nda
             if subject[i] == subject[i - 1]:
                 e[i] = 0.5 * e[i - 1] + np.sqrt(0.75) * e[i]
         d = smooth(n)[subject] + e
-    d[:, :N_EFFECT] += effect * x[:, None]
+    d[:, :N_SIMULATED] += effect * x[:, None]
     return d[..., None], t, subject
 
 
@@ -74,7 +74,7 @@ def found(run: int, setting: tuple[int, str, str], effect: float, variances: str
     p = model.vertex_test(E)[2]
     U, S, _ = np.linalg.svd(E[..., 0], full_matrices=False)
     whole = model.test(U[:, :4] * S[:4])[1] <= 0.05
-    return [(p[:N_EFFECT] <= 0.05).mean() if effect else p.min() <= 0.05, whole]
+    return [(p[:N_SIMULATED] <= 0.05).mean() if effect else p.min() <= 0.05, whole]
 
 
 def rates(setting: tuple[int, str, str], runs: int) -> list[float]:

@@ -3,7 +3,8 @@
 ``landmarks.py [--tuned]``: pairs of mouse skulls of the shared data with 51 landmarks each.  Five
 times every fifth is given (ten or eleven), and the distance of all to where they were marked is
 told in mm, apart for the given and the others, beside a registration without any.  Their weight
-was chosen on the pair that ``--tuned`` shows.  Far poses are in ``poses.py --landmarks``.
+was chosen on the pair that ``--tuned`` shows.  Large pose differences are in ``poses.py
+--landmarks``.
 """
 
 import argparse

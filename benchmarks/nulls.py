@@ -16,7 +16,7 @@ from scipy import stats
 
 from s4a.analysis.permutation import Model, indicators
 
-N_VERTICES, N_PLANTED = 40, 4
+N_VERTICES, N_SIMULATED = 40, 4
 N_PERMUTATIONS = 99
 SCALES = np.array([3, 2, 1.5, 1, 0.7, 0.5])  # standard deviations of the scores
 EFFECT_AT_VERTEX, EFFECT_ON_SCORE = 1.2, 2.5  # times the variable of variance 1
@@ -98,9 +98,9 @@ def rates(setting: Setting, variances: str, runs: int) -> np.ndarray:
         if run % 5:
             continue
         effect = (x[:, 0] - x[:, 0].mean()) / x[:, 0].std()
-        d[:, :N_PLANTED, 0] += EFFECT_AT_VERTEX * effect[:, None]
+        d[:, :N_SIMULATED, 0] += EFFECT_AT_VERTEX * effect[:, None]
         scores[:, 0] += EFFECT_ON_SCORE * effect
-        found[run, 2] = (model.vertex_test(d)[2][:N_PLANTED] <= 0.05).mean()
+        found[run, 2] = (model.vertex_test(d)[2][:N_SIMULATED] <= 0.05).mean()
         found[run, 3] = model.test(scores)[1] <= 0.05
     return np.nanmean(found, axis=0)
 
@@ -110,7 +110,7 @@ def beside_t_tests(smooth: bool, runs: int) -> np.ndarray:
 
     Two groups of 10, 200 vertices on a circle, an effect of one standard deviation along x at 20.
     """
-    n, v, n_planted = 20, 200, 20
+    n, v, n_simulated = 20, 200, 20
     away = abs(np.arange(v)[:, None] - np.arange(v)) / v
     W = np.exp(-0.5 * (np.minimum(away, 1 - away) / 0.05) ** 2) if smooth else np.eye(v)
     W /= np.linalg.norm(W, axis=1, keepdims=True)
@@ -129,8 +129,8 @@ def beside_t_tests(smooth: bool, runs: int) -> np.ndarray:
                 v * p[:, 0],
             ]
             is_found = np.array(corrected) <= 0.05  # (4, v)
-            found[run] = is_found.any(1) if found is error else is_found[:, :n_planted].mean(1)
-            d[:, :n_planted, 0] += 2 * x[:, None] - 1
+            found[run] = is_found.any(1) if found is error else is_found[:, :n_simulated].mean(1)
+            d[:, :n_simulated, 0] += 2 * x[:, None] - 1
     return np.array([error.mean(0), power.mean(0)])
 
 

@@ -57,7 +57,7 @@ PAIRS = {  # folder, the files of a collection, and the places of its templates 
 PAIRS_CHOSEN_ON = tuple(PAIRS)[:3]  # as are the thresholds of s4a.study.quality_control
 CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspond
 WAYS: dict[str, dict] = {"as by default": {}, "10 landmarks": {"init": "landmarks"}}
-PLANTED_IN = {  # as PAIRS
+SIMULATED_IN = {  # as PAIRS
     "bodies 0-9": ("faust", list(range(10)), (0,)),
     "cats": ("cats", list(range(11)), (0,)),
     "faces 1-12": ("faces", list(range(1, 13)), (0,)),
@@ -65,7 +65,7 @@ PLANTED_IN = {  # as PAIRS
     "faces 13-24": ("faces", list(range(13, 25)), (0,)),
     "children": ("kids", list(range(6)), (0,)),
 }
-PLANTED_CHOSEN_ON = tuple(PLANTED_IN)[:3]
+SIMULATED_CHOSEN_ON = tuple(SIMULATED_IN)[:3]
 TURNS = {  # along the principal axes of the target, the shortest first
     "half a turn about the longest axis": (-1, -1, 1),
     "half a turn about the middle axis": (-1, 1, -1),
@@ -341,7 +341,7 @@ def judged(name, at, meshes, shapes):
 
     A simulated failure is compared with the default registrations of the others.
     """
-    part = PLANTED_IN[name][0]
+    part = SIMULATED_IN[name][0]
     template, *others = [list(shapes)[at], *(n for i, n in enumerate(shapes) if i != at)]
     error, registration_error, distortion = {}, {}, {}
     for way in ("as by default", *TURNS):
@@ -412,12 +412,12 @@ def simulated(names):
     """Of how many registrations that were begun wrongly and failed a run would tell."""
     table = {}
     with tempfile.TemporaryDirectory() as folder:
-        parts = sorted({PLANTED_IN[name][0] for name in names})
+        parts = sorted({SIMULATED_IN[name][0] for name in names})
         command = [sys.executable, DATA / "unpack.py", folder, *parts]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         options = Options(bidirectional=False, n_coarse=3000)
         for name in names:
-            part, numbers, places = PLANTED_IN[name]
+            part, numbers, places = SIMULATED_IN[name]
             files = sorted((Path(folder) / part).glob("*.ply"))
             meshes = {files[i].stem: s4a.read_shape(files[i]) for i in numbers}
             shapes = {n: pair.shape_of(mesh, options) for n, mesh in meshes.items()}
@@ -438,7 +438,7 @@ def simulated(names):
         of = [
             one
             for (n, _), all_ in table.items()
-            if (n in PLANTED_CHOSEN_ON) == chosen
+            if (n in SIMULATED_CHOSEN_ON) == chosen
             for one in all_
         ]
         failed, told, right, vain, _ = counts(of)
@@ -472,7 +472,7 @@ def main(names):
         for name in names:
             mine = {kind: mesh for kind, mesh in others.items() if kind != name}
             table[name] = rows_of(name, collection(name, Path(folder)), mine)
-    sys.stdout.write(f"\nplanted | {' | '.join(table)}\n")
+    sys.stdout.write(f"\nsimulated | {' | '.join(table)}\n")
     for row in dict.fromkeys(row for rows in table.values() for row in rows):
         cells = " | ".join(rows.get(row, "") for rows in table.values())
         sys.stdout.write(f"{row} | {cells}\n")
@@ -482,6 +482,6 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["registrations"]:
         registrations(sys.argv[2:] or list(PAIRS))
     elif sys.argv[1:2] == ["simulated"]:
-        simulated(sys.argv[2:] or list(PLANTED_IN))
+        simulated(sys.argv[2:] or list(SIMULATED_IN))
     else:
         main(sys.argv[1:])

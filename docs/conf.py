@@ -223,9 +223,13 @@ STATE = "application/vnd.jupyter.widget-state+json"
 
 
 def pack_page(app, pagename, templatename, context, doctree):
-    """Compress the pictures of a page and remove the states of widgets."""
+    """Compress the pictures of a page, remove the states of widgets, give captions a level."""
     scripts = context.get("script_files", [])
     scripts[:] = [one for one in scripts if getattr(one, "attributes", {}).get("type") != STATE]
+    tree = context.get("furo_navigation_tree", "")
+    context["furo_navigation_tree"] = tree.replace(
+        'role="heading"', 'role="heading" aria-level="2"'
+    )
     pattern = rf"data:image/png;base64,([A-Za-z0-9+/]{{{LARGE},}}=*)"
     if "body" in context:
         context["body"] = re.sub(pattern, smaller, context["body"])

@@ -58,9 +58,9 @@ def explore(
     >>> s4a.explore(study).tabs.titles[:3]
     ('Modes', 'Network', 'Functional map')
     """
+    panels = import_module("s4a.widgets.explore")  # a missing package is reported first
     check_type(study, xr.DataTree)
-    options = {"width": width, "font": font, "view": view, "up": up}
-    return import_module("s4a.widgets.explore").explore(study, **options)
+    return panels.explore(study, width=width, font=font, view=view, up=up)
 
 
 @xr.register_datatree_accessor("s4a")

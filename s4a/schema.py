@@ -363,7 +363,7 @@ HOLDS = {
         SEEN,
     ),
     "network/comparison": ("moment fit fit_mirrored chirality", "", SEEN),
-    "network/chirality": ("shape mean_chirality reflected", "told", ""),
+    "network/chirality": ("shape mean_chirality reflected", "remarks", ""),
     "network/alignment": ("rotation translation", "reference", ""),
     "network/initial": ("source target fmap_initial", "", ""),
     "network": ("source target fmap_initial fmap weight cycle_error", "", ""),

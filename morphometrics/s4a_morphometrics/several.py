@@ -136,12 +136,8 @@ def analyse_structures(
         log.warning("%s", line)
     with folder_of(store) as folder:
         (folder / FOLDER).mkdir(parents=True, exist_ok=True)
-        notes = {
-            "structures": list(parts),
-            "remarks": remarks,
-            "mirrored": mirrored,
-            "chirality": chirality,
-        }
+        notes: dict[str, Any] = {"structures": list(parts), "remarks": remarks}
+        notes |= {"mirrored": mirrored, "chirality": chirality}
         (folder / f"{NOTES}.tmp").write_text(json.dumps(notes))
         (folder / f"{NOTES}.tmp").replace(folder / NOTES)
         studies = {}

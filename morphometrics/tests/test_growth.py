@@ -87,7 +87,7 @@ def test_a_covariate_that_changes_nothing_changes_no_statistic(simulated):
     assert np.allclose([fit["statistic"] for fit in fits], fits[0]["statistic"])
 
 
-def test_simulated_growth_is_located_with_its_slope(simulated):
+def test_a_simulated_growth_is_found_where_it_is_with_its_slope(simulated):
     fit = growth(simulated, "age", "person", n_permutations=199)
     assert np.allclose(fit["effect"].values[TOP, 0].mean(), 0.05, rtol=0.15)
     assert abs(fit["effect"].values[~TOP]).mean() < 0.01

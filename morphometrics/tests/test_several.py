@@ -122,7 +122,7 @@ def test_a_second_run_finds_all_done(files, store):
 
 def test_folders_of_one_and_of_several_structures_are_not_confused(store, files, tmp_path):
     for command in (s4a.open_study, s4a.verify):
-        with pytest.raises(ValueError, match=r"has studies in it: give one of them.*ures.left"):
+        with pytest.raises(ValueError, match=r"contains studies: give one of them.*ures.left"):
             command(store)
     with pytest.raises(ValueError, match="is not a multi-structure study"):
         open_structures(store / "structures/left")
@@ -141,7 +141,7 @@ def test_folders_of_one_and_of_several_structures_are_not_confused(store, files,
 def test_the_core_says_who_analyses_several_structures(six, files):
     with pytest.raises(ValueError, match="dict of left, right; s4a_morphometrics"):
         s4a.analyse(six, **SMALL)
-    with pytest.raises(ValueError, match=r"column 'structure' names several.*run-structures"):
+    with pytest.raises(ValueError, match=r"column 'structure', found several.*run-structures"):
         s4a.analyse(files[0], table=files[1], **SMALL)
 
 

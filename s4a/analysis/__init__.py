@@ -1,4 +1,4 @@
-"""What is done with a registered collection (6): statistics, the model, transfer."""
+"""Analysis of a registered collection (6): statistics, shape model, transfer."""
 
 from pkgutil import iter_modules
 

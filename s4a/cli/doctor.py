@@ -163,9 +163,9 @@ def writable(what: str, folder: Path, instead: str) -> Finding:
         with tempfile.TemporaryDirectory(prefix=".s4a-", dir=folder) as name:
             there = Path(name) / "a"
             with open(there, "w") as file, contextlib.suppress(ImportError):
-                from s4a.study.processes import hold
+                from s4a.study.processes import try_lock
 
-                hold(file.fileno())
+                try_lock(file.fileno())
             there.rename(Path(name) / "b")
     except OSError as error:
         return Finding(what, "missing", f"{folder}: {error}", f"give another: {instead}")

@@ -1,7 +1,4 @@
-"""Accuracy (5.2): how far a registration is from a known truth.
-
-Two simpler ways to the same correspondence stand beside it.
-"""
+"""Accuracy of registrations with known ground truth (5.2), compared with two baselines."""
 
 from collections.abc import Callable
 
@@ -25,7 +22,7 @@ MATCH, SURFACE = "S4A, matched vertex", "S4A, registered surface"
 
 
 def simple_matches(source: Shape, target: Shape, *, k_init: int = 20) -> dict[str, np.ndarray]:
-    """Matches without the collection: nearest neighbour after ICP, and ZoomOut with eq. 4 (4.1).
+    """Return baseline matches: nearest neighbour after ICP, and ZoomOut with eq. 4 (4.1).
 
     Parameters
     ----------
@@ -47,7 +44,7 @@ def simple_matches(source: Shape, target: Shape, *, k_init: int = 20) -> dict[st
 
 
 def _errors(source, target, registered, image, n_geodesic):
-    """Mean errors of all methods on one shape: straight line, and geodesic where asked for."""
+    """Mean Euclidean errors of all methods on one shape, and geodesic ones if requested."""
     known = np.isfinite(image).all(axis=1)
     (X, T), size = as_arrays(source.original), source.frame[1]
     with threadpool_limits(1):
@@ -57,16 +54,16 @@ def _errors(source, target, registered, image, n_geodesic):
         images = {name: X[match] for name, match in matches.items()}
         images[SURFACE] = (moved - t) @ R / s
         errors = {
-            name: [np.linalg.norm(found - image, axis=1)[known].mean() / size, np.nan]
-            for name, found in images.items()
+            name: [np.linalg.norm(X_image - image, axis=1)[known].mean() / size, np.nan]
+            for name, X_image in images.items()
         }
         if n_geodesic:
-            some = np.flatnonzero(known)[:: max(1, known.sum() // n_geodesic)]
-            true = cKDTree(X).query(image[some])[1]
-            found = np.concatenate([match[some] for match in matches.values()])
-            far = geodesic_error(X, T, found, np.tile(true, len(matches)))
-            for name, each in zip(matches, far.reshape(len(matches), -1), strict=True):
-                errors[name][1] = each.mean()
+            sample = np.flatnonzero(known)[:: max(1, known.sum() // n_geodesic)]
+            true = cKDTree(X).query(image[sample])[1]
+            matched = np.concatenate([match[sample] for match in matches.values()])
+            error = geodesic_error(X, T, matched, np.tile(true, len(matches)))
+            for name, row in zip(matches, error.reshape(len(matches), -1), strict=True):
+                errors[name][1] = row.mean()
     return list(errors.values())
 
 
@@ -77,7 +74,7 @@ def accuracy(
     n_geodesic: int = 0,
     n_jobs: int | None = None,
 ) -> xr.Dataset:
-    """Mean error of a study's registrations against the truth, beside two baselines.
+    """Return mean errors of a study's registrations, compared with two baselines.
 
     Parameters
     ----------
@@ -85,19 +82,23 @@ def accuracy(
         A finished study.
     image : callable
         ``image(shape, template)`` gives the true position of every template vertex on the shape, in
-        the frame of its file, ``(n_template, 3)``; NaN where it has none.
+        the frame of its file, ``(n_template, 3)``; NaN if unknown.
     n_geodesic : int
-        On how many vertices the error is measured along the edges of the shape as well (Princeton
-        protocol, between the vertex nearest to the truth and the matched one); slow.
+        Number of vertices at which geodesic errors along edges are computed as well (Princeton
+        protocol, between the vertex nearest to the true position and the matched one); slow.
     n_jobs : int, optional
         As in joblib.
 
     Returns
     -------
     xarray.Dataset
-        ``error(algorithm, shape)`` in a straight line and ``geodesic_error(algorithm, shape)``,
-        both as shares of sqrt(area).  A matched vertex cannot be nearer to the truth than the
-        sampling of the shape allows; the registered surface is not bound to vertices.
+        Euclidean ``error(algorithm, shape)`` and ``geodesic_error(algorithm, shape)``, both as
+        shares of sqrt(area).  A vertex-to-vertex match cannot be more accurate than the vertex
+        spacing; the registered surface can.
+
+    See Also
+    --------
+    s4a.metrics.evaluate : all metrics of one correspondence.
     """
     registration = study["registration"].to_dataset()
     template = registration.attrs["template"]
@@ -109,7 +110,7 @@ def accuracy(
         return Shape(original, coarse)
 
     target = shape(template)
-    found = workers(n_jobs)(
+    errors = workers(n_jobs)(
         delayed(_errors)(
             shape(name),
             target,
@@ -119,10 +120,10 @@ def accuracy(
         )
         for name in names
     )
-    both = np.array(found).reshape(len(names), 4, 2).T  # (measure, method, shape)
+    error, geodesic = np.array(errors).reshape(len(names), 4, 2).T  # (algorithm, shape) each
     note = {"units": "share of sqrt(area)"}
     return xr.Dataset(
-        {"error": (("algorithm", "shape"), both[0], note)}
-        | {"geodesic_error": (("algorithm", "shape"), both[1], note)},
+        {"error": (("algorithm", "shape"), error, note)}
+        | {"geodesic_error": (("algorithm", "shape"), geodesic, note)},
         {"algorithm": [ICP, ZOOMOUT, MATCH, SURFACE], "shape": names},
     )

@@ -1,6 +1,6 @@
-"""The methods of the paper's comparison side by side: Table 1 and Fig. 3 (5.2), Table 2 (5.3).
+"""Comparison of methods: Table 1 and Fig. 3 (5.2), Table 2 (5.3).
 
-All work on one cleaned input.  What the methods are is in :mod:`s4a.evaluation.methods`.
+All methods use the same cleaned meshes.  :mod:`s4a.evaluation.methods` implements them.
 """
 
 import io
@@ -22,8 +22,8 @@ from s4a.evaluation.methods import (
     BLOCKS,
     INITS,
     METHODS,
-    OUR_METHODS,
     PAPER_METHODS,
+    S4A_METHODS,
     Clock,
     Matches,
     Outcome,
@@ -58,18 +58,18 @@ PRESETS: dict[str | None, dict[str, Any]] = {
 
 
 def check_some(methods: Sequence[str], known: Sequence[str]) -> None:
-    """ValueError unless the methods are some of the known ones."""
+    """Raise ValueError unless all methods are known."""
     wrong = [method for method in methods if method not in known]
     if wrong or not len(methods) or isinstance(methods, str):
         raise ValueError(f"methods must be some of {', '.join(known)}; found {wrong or methods!r}")
 
 
 def checked_methods(methods: Sequence[str] | None, preset: str | None) -> Sequence[str]:
-    """The methods; all by default, of the paper alone with its preset, which has no others."""
+    """Return the methods, by default all, or those of the paper with its preset."""
     if methods is None:
         return PAPER_METHODS if preset == "paper" else METHODS
     check_some(methods, METHODS)
-    added = [method for method in methods if method in OUR_METHODS]
+    added = [method for method in methods if method in S4A_METHODS]
     if preset == "paper" and added:
         raise ValueError(
             f"preset 'paper' has the methods {', '.join(PAPER_METHODS)}; "
@@ -86,31 +86,30 @@ def load_mesh(shape: Mesh, what: str) -> tuple[xr.Dataset, float]:
 
 
 def in_mesh(vertices: np.ndarray, mesh: xr.Dataset) -> np.ndarray:
-    """Vertices of the mesh that rows of its file became ``(n,)``.
+    """Convert rows of a file to vertices of its clean mesh ``(n,)``.
 
-    Rows that are -1, or were dropped, become -1.
+    Rows that are -1, or were dropped by cleaning, become -1.
     """
     became = mesh["vertex_of_file"].values
     if vertices.max(initial=-1) >= len(became):
-        raise ValueError(f"rows of the file, below {len(became)}, needed; found {vertices.max()}")
+        raise ValueError(f"rows of the file must be below {len(became)}; found {vertices.max()}")
     return np.where(vertices >= 0, became[np.maximum(vertices, 0)], -1)
 
 
 def ground_truth_in_meshes(truth: np.ndarray, source: xr.Dataset, target: xr.Dataset) -> np.ndarray:
-    """Truth over the rows of the target's file.
-
-    Which are rows of the source's file or positions, for the meshes.
+    """Convert ground truth for the rows of files to ground truth for clean meshes.
 
     Parameters
     ----------
     truth : ndarray (n_file_target,) of integers, or (n_file_target, 3)
+        Rows of the source's file, or positions.
     source, target : Dataset
-        As of :func:`s4a.read_shape`.
+        From :func:`s4a.read_shape`.
     """
     truth, n = np.asarray(truth), target.sizes["file_vertex_index"]
     if truth.shape not in ((n,), (n, 3)) or (truth.ndim == 1 and truth.dtype.kind not in "iu"):
         raise ValueError(
-            f"truth needs a row of the source's file (integer, -1 where there is none) or a "
+            f"truth needs a row of the source's file (integer, -1 if unknown) or a "
             f"position for each of the {n} vertices of the target's "
             f"file; found {truth.dtype} of shape {truth.shape}"
         )
@@ -119,21 +118,21 @@ def ground_truth_in_meshes(truth: np.ndarray, source: xr.Dataset, target: xr.Dat
 
 
 def read_ground_truth(path: Path | str) -> np.ndarray:
-    """Truth from a file, for the vertices of the target's file.
+    """Read ground truth for the vertices of the target's file.
 
-    NPY, or text with a number or three in each row.
+    NPY, or text with one or three numbers in each row.
     """
     try:
         data = content(path)
         delimiter = "," if str(path).endswith(".csv") else None
         as_text = not str(path).endswith(".npy")
-        found = (
+        truth = (
             np.loadtxt(io.StringIO(text_of(data)), delimiter=delimiter) if as_text else npy(data)
         )
     except ValueError as error:
         raise ValueError(f"{shown(path)} cannot be read as truth: {shown(error)}") from error
-    whole = found.ndim == 1 and np.array_equal(found, np.round(found))
-    return found.astype(np.int64) if whole else found
+    whole = truth.ndim == 1 and np.array_equal(truth, np.round(truth))
+    return truth.astype(np.int64) if whole else truth
 
 
 def compare(
@@ -155,20 +154,19 @@ def compare(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset | xr.DataTree:
-    """Compare the five methods of Table 1, and three of S4A, on one pair of meshes or several.
+    """Compare the five methods of Table 1 and three of S4A on one or several pairs of meshes.
 
-    All methods take the same cleaned meshes.
+    All methods use the same cleaned meshes.
 
     kNN: nearest neighbour in space after rigid alignment.  ZO: from that match, ZoomOut at full
     resolution.  FMAP+ZO: functional map fitted on landmarks at full resolution, then ZoomOut.
     SCALABLE: the same in the space of :mod:`s4a.method.scalable`.  RE-MATCH: the same on the
     low-resolution mesh, and eq. 4 with U Phi, as ``s4a.match_pair(..., preset="paper")``.
 
-    Ours are RE-MATCH refined: with the eigenfunctions of :mod:`s4a.method.refined_eigenfunctions`
-    in the place of U Phi, and the last two iterations of ZoomOut look among all vertices of the
-    source; registered: the default of ``s4a.match_pair`` after RE-MATCH, of which the matched
-    vertices are compared, as of all others; and registered surface: the same, of which the surface
-    is.
+    S4A adds three methods.  RE-MATCH refined: eigenfunctions of
+    :mod:`s4a.method.refined_eigenfunctions` instead of U Phi, and the final iterations of ZoomOut
+    search all vertices of the source.  Registered: the matched vertices of the default of
+    :func:`s4a.match_pair` after RE-MATCH.  Registered surface: the registered surface itself.
 
     Parameters
     ----------
@@ -177,7 +175,7 @@ def compare(
     target : path, Dataset, or dict of str to path or Dataset
         One mesh, or several with a name for each pair.
     methods : sequence of str, optional
-        Some of :data:`METHODS`; all by default, the paper's five with the preset.
+        Some of :data:`METHODS`; by default all, or the five of the paper with its preset.
     truth : array, or dict of str to array, optional
         Ground truth: vertices or positions of the source, as in
         :func:`s4a.evaluation.metrics.evaluate`; a dict if `target` is one.  If shapes are given as
@@ -187,55 +185,54 @@ def compare(
         `target` is one.  By default 10 farthest-point samples of the source and the vertices of the
         target that are nearest after alignment (4.1, step 3).
     n_coarse : int
-        Vertices of the low-resolution mesh, and samples of SCALABLE.
+        Number of vertices of the low-resolution mesh, and of samples of SCALABLE.
     k_init, k : int
-        Sizes of the first and of the refined map; as many as the meshes have functions, where these
-        are fewer.
+        Sizes of the initial and the refined map; at most the number of eigenfunctions.
     step : int
-        Growth of the map per round of ZoomOut, as in :func:`s4a.analyse`.  Steps of 10 take half
-        the time of that block of ZO and FMAP+ZO; on a child of 60,000 vertices in two poses they
-        end 7 to 9 % farther from the truth.
+        Growth of the map in each iteration of ZoomOut, as in :func:`s4a.analyse`.
     preset : {None, "paper"}
-        ``"paper"`` leaves out our methods and sets full_resolution_iterations=0 and
+        ``"paper"`` leaves out the methods of S4A and sets full_resolution_iterations=0 and
         init="landmarks"; another value of these is refused.
     full_resolution_iterations : int, optional
-        Rounds of ZoomOut of RE-MATCH refined that look among all vertices of the source, 2 by
-        default.
+        ZoomOut iterations of RE-MATCH refined that search all vertices of the source, by default 2.
     init : {"landmarks", "descriptors"}, optional
-        Initial maps of all methods but kNN and ZO from heat kernels around landmarks (default), as
-        in :func:`s4a.match_pair` with the preset, or from wave kernels of the shapes and around
-        landmarks, as pyFM has them.
+        Initial maps of all methods except kNN and ZO: from heat kernels around landmarks (default),
+        as in :func:`s4a.match_pair` with the preset, or from wave kernels as in pyFM.
     n_geodesic : int
         See :func:`s4a.evaluation.metrics.evaluate`.
     keep : bool
-        Whether the meshes, matches and maps are returned, too, as
-        :class:`s4a.widgets.Comparison` shows them: some 30 bytes a vertex and method.
+        Whether to return meshes, matches and maps, too, for :class:`s4a.widgets.Comparison`: about
+        30 bytes per vertex and method.
     seed, rng : see :mod:`s4a.seeds`
 
     Returns
     -------
     Dataset, or DataTree with `keep`
-        Every metric of :func:`s4a.evaluation.metrics.evaluate` over ``(way, pair)``, ``way`` the
-        method, and ``block_seconds(algorithm, pair, block)``, the blocks of Fig. 3, in CPU seconds
-        of one core.  What two methods share, as the alignment or a basis, is made once and charged
-        to both; the alignment only to those that use it, which with given landmarks are kNN, ZO and
-        registered.  The attribute ``note`` says where k had to be reduced.
+        Every metric of :func:`s4a.metrics.evaluate` over ``(algorithm, pair)``, and
+        ``block_seconds(algorithm, pair, block)``, CPU seconds of one core for the blocks of Fig. 3.
+        Results that methods share, such as the alignment or a basis, are computed once and charged
+        to each method that uses them.  The attribute ``note`` names pairs with a reduced k.
 
-        With `keep` this is ``/metrics`` of a tree, whose ``/source`` is the source's mesh and
-        ``/pairs/<pair>`` the target's, with what :func:`kept` says.
+        With `keep`, the metrics are the node ``/metrics`` of a tree; ``/source`` is the mesh of the
+        source, and ``/pairs/<pair>`` that of a target with the results of :func:`with_results`.
 
     Raises
     ------
     ValueError
-        When a method is unknown, a mesh lacks its variables, or truth or landmarks do not fit.
+        If a method is unknown, a mesh lacks variables, or truth or landmarks do not fit.
+
+    See Also
+    --------
+    compare_collection : Table 2, for a collection.
+    s4a.metrics.evaluate : the metrics of one correspondence.
 
     Examples
     --------
     >>> import s4a
     >>> ball = s4a.synthetic.ellipsoid(300)
     >>> options = {"n_coarse": 100, "k_init": 6, "k": 10}
-    >>> found = s4a.compare(ball, ball, methods=["kNN", "RE-MATCH"], **options)
-    >>> found["chamfer"].sel(pair="pair", algorithm="kNN").item()
+    >>> table = s4a.compare(ball, ball, methods=["kNN", "RE-MATCH"], **options)
+    >>> table["chamfer"].sel(pair="pair", algorithm="kNN").item()
     0.0
     """
     if not isinstance(target, dict):
@@ -253,7 +250,7 @@ def compare(
     if any(isinstance(mesh, xr.Dataset) != in_memory for mesh in target.values()):
         raise ValueError("source and targets need to be all paths or all Datasets")
     if keep and any("/" in str(name) for name in target):
-        raise ValueError(f"with keep=True names of pairs hold no '/'; found {', '.join(target)}")
+        raise ValueError(f"with keep=True, names must not contain '/'; found {', '.join(target)}")
     options: dict[str, Any] = {"k_init": k_init, "k": k, "step": step} | settings
     rows, nodes, notes = [], {}, {}
     with threadpool_limits(1):
@@ -266,30 +263,30 @@ def compare(
             true = None if truth is None else truth[name]
             if true is not None and not in_memory:
                 true = ground_truth_in_meshes(true, M.mesh, N.mesh)
-            both = Pair(M, N, marks, **options)
+            pair = Pair(M, N, marks, **options)
             row, outcomes = metrics_of_pair(
-                both, methods, load_source + load_target, true, n_geodesic
+                pair, methods, load_source + load_target, true, n_geodesic
             )
             rows.append(row)
             notes[name] = row.attrs.pop("note", "")
             if keep:
-                nodes[f"pairs/{name}"] = kept(M.mesh, N.mesh, outcomes, true)
+                nodes[f"pairs/{name}"] = with_results(M.mesh, N.mesh, outcomes, true)
     table = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
     table = table.assign_coords(pair=list(target)).transpose("algorithm", "pair", ...)
-    table = table.assign_attrs(options | {"n_coarse": n_coarse, "seed": seed} | told(notes))
+    table = table.assign_attrs(options | {"n_coarse": n_coarse, "seed": seed} | joint_note(notes))
     if not keep:
         return table
     return xr.DataTree.from_dict({"metrics": table, "source": without_coords(M.mesh), **nodes})
 
 
 def note_on_k(k: int, least: int) -> dict[str, str]:
-    """What is told, as an attribute, where meshes have fewer functions than k."""
-    note = f"k = {k} reduced to {least}, the eigenfunctions that the smaller mesh has"
+    """Return a note as an attribute if meshes have fewer eigenfunctions than k."""
+    note = f"k = {k} reduced to {least}, the number of eigenfunctions of the smaller mesh"
     return {"note": note} if least < k else {}
 
 
-def told(notes: Mapping[str, str]) -> dict[str, str]:
-    """Notes by what they are on, as an attribute and in the log; nothing where all are empty."""
+def joint_note(notes: Mapping[str, str]) -> dict[str, str]:
+    """Log the notes of all pairs and return them as one attribute, if there are any."""
     note = "; ".join(f"{name}: {text}" for name, text in notes.items() if text)
     if not note:
         return {}
@@ -298,52 +295,52 @@ def told(notes: Mapping[str, str]) -> dict[str, str]:
 
 
 def without_coords(mesh: xr.Dataset) -> xr.Dataset:
-    """A mesh without the coordinates that it has of a tree, which may not be those of another."""
+    """Return a mesh without the coordinates that it inherited from a tree."""
     return mesh.drop_vars(list(mesh.coords))
 
 
-def kept(
+def with_results(
     source: xr.Dataset, target: xr.Dataset, outcomes: dict[str, Outcome], truth: ArrayLike | None
 ) -> xr.Dataset:
-    """The target's mesh, and what every method found on it.
+    """Return the target's mesh with the results of every method.
 
     Returns
     -------
     Dataset
-        ``algorithm_match(algorithm, vertex)``, ``algorithm_image(algorithm, vertex, xyz)``, where
-        the vertices of the target lie on the source, in its unit, ``algorithm_reverse(algorithm,
-        source_vertex)``, the match the other way, and ``algorithm_area_change(algorithm, vertex)``,
-        the log area ratio of :func:`s4a.method.register.log_area_ratio`; where a method of them has
-        maps, ``algorithm_fmap(algorithm, eigenpair_target, eigenpair_source)`` and
-        ``algorithm_fmap_initial``, NaN for the others; with truth ``true_position(vertex, xyz)``,
-        ``true_match(vertex)`` and ``algorithm_error(algorithm, vertex)``, the distance to it in a
-        straight line as a share of sqrt(area), NaN where it is unknown.
+        ``algorithm_match(algorithm, vertex)``; ``algorithm_image(algorithm, vertex, xyz)``, the
+        target's vertices on the source, in its unit; ``algorithm_reverse(algorithm,
+        source_vertex)``, the match in the other direction; ``algorithm_area_change(algorithm,
+        vertex)``, the log area ratio of :func:`s4a.method.register.log_area_ratio`.  If any method
+        has maps, ``algorithm_fmap(algorithm, eigenpair_target, eigenpair_source)`` and
+        ``algorithm_fmap_initial``, NaN for the others.  With ground truth
+        ``true_position(vertex, xyz)``, ``true_match(vertex)`` and
+        ``algorithm_error(algorithm, vertex)``, the Euclidean error as a share of sqrt(area), NaN if
+        unknown.
     """
-    (X, T), (Y, S), each = as_arrays(source), as_arrays(target), outcomes.values()
-    images = [X[one.match] if one.image is None else one.image for one in each]
-    found: dict[str, ArrayLike] = {
-        "algorithm_match": np.stack([one.match for one in each]).astype(np.int32),
-        "algorithm_reverse": np.stack([one.reverse for one in each]).astype(np.int32),
+    (X, T), (Y, S), results = as_arrays(source), as_arrays(target), outcomes.values()
+    images = [X[r.match] if r.image is None else r.image for r in results]
+    variables: dict[str, ArrayLike] = {
+        "algorithm_match": np.stack([r.match for r in results]).astype(np.int32),
+        "algorithm_reverse": np.stack([r.reverse for r in results]).astype(np.int32),
         "algorithm_image": np.stack(images).astype(np.float32),
         "algorithm_area_change": np.stack([log_area_ratio(image, Y, S) for image in images]).astype(
             np.float32
         ),
     }
-    if any(one.fmap is not None for one in each):
-        found["algorithm_fmap"] = stacked([one.fmap for one in each])
-        found["algorithm_fmap_initial"] = stacked([one.first for one in each])
+    if any(r.fmap is not None for r in results):
+        variables["algorithm_fmap"] = stacked([r.fmap for r in results])
+        variables["algorithm_fmap_initial"] = stacked([r.initial for r in results])
     if truth is not None:
         true, vertex = metrics.true_positions(truth, X, len(Y))
         errors = np.linalg.norm(np.stack(images) - true, axis=2) / np.sqrt(vertex_areas(X, T).sum())
-        found |= {"true_position": true, "true_match": vertex.astype(np.int32)}
-        found["algorithm_error"] = errors.astype(np.float32)
-    return (
-        without_coords(target).merge(dataset(None, **found)).assign_coords(algorithm=list(outcomes))
-    )
+        variables |= {"true_position": true, "true_match": vertex.astype(np.int32)}
+        variables["algorithm_error"] = errors.astype(np.float32)
+    mesh = without_coords(target).merge(dataset(None, **variables))
+    return mesh.assign_coords(algorithm=list(outcomes))
 
 
 def stacked(maps: list[np.ndarray | None]) -> np.ndarray:
-    """Maps as one array, with NaN where one is smaller than others or there is none.
+    """Stack maps in one array, padded with NaN.
 
     Examples
     --------
@@ -353,53 +350,53 @@ def stacked(maps: list[np.ndarray | None]) -> np.ndarray:
     (2, 2, 2)
     """
     sizes = [C.shape for C in maps if C is not None]
-    found = np.full((len(maps), *np.max(sizes, axis=0)), np.nan)
-    for place, C in zip(found, maps, strict=True):
+    stack = np.full((len(maps), *np.max(sizes, axis=0)), np.nan)
+    for padded, C in zip(stack, maps, strict=True):
         if C is not None:
-            place[: C.shape[0], : C.shape[1]] = C
-    return found
+            padded[: C.shape[0], : C.shape[1]] = C
+    return stack
 
 
 def landmarks_of(given: Any, source: Spaces, target: Spaces, clean: bool) -> Matches:
-    """Vertices of both meshes that landmarks mean.
+    """Return landmarks as vertices of both meshes.
 
-    The nearest ones to positions ``(p, 3)``, or those that rows of their files became.
+    Positions ``(p, 3)`` give the nearest vertices, rows of files those of the clean meshes.
     """
     ends: list[np.ndarray] = []
     for marks, space in zip(given, (source, target), strict=True):
-        at = np.asarray(marks)
-        if at.ndim == 2 and at.shape[1] == 3:
-            at = cKDTree(space.mesh["position"].values).query(at)[1]
-        elif not clean and at.dtype.kind in "iu":
-            at = in_mesh(at, space.mesh)
-        ends.append(at)
-        good = at.ndim == 1 and at.dtype.kind in "iu" and len(at) >= 3
-        if not (good and 0 <= at.min() <= at.max() < len(space.X) and len(at) == len(ends[0])):
+        v = np.asarray(marks)
+        if v.ndim == 2 and v.shape[1] == 3:
+            v = cKDTree(space.mesh["position"].values).query(v)[1]
+        elif not clean and v.dtype.kind in "iu":
+            v = in_mesh(v, space.mesh)
+        ends.append(v)
+        good = v.ndim == 1 and v.dtype.kind in "iu" and len(v) >= 3
+        if not (good and 0 <= v.min() <= v.max() < len(space.X) and len(v) == len(ends[0])):
             raise ValueError(
                 "landmarks need two arrays of at least 3 vertices that the clean meshes have, of "
-                f"the source and of the target; found {at.tolist()} of the "
+                f"the source and of the target; found {v.tolist()} of the "
                 f"{'target' if len(ends) > 1 else 'source'}"
             )
     return ends[0], ends[1]
 
 
 def metrics_of_pair(
-    both: Pair, methods: Sequence[str], load: float, truth: np.ndarray | None, n_geodesic: int
+    pair: Pair, methods: Sequence[str], load: float, truth: np.ndarray | None, n_geodesic: int
 ) -> tuple[xr.Dataset, dict[str, Outcome]]:
-    """All methods on one pair: metrics and times over ``way``, and what each has found."""
-    outcomes = {method: both.run(method) for method in methods}
+    """Run all methods on one pair; return metrics and times, and the outcomes."""
+    outcomes = {method: pair.run(method) for method in methods}
     options: dict[str, Any] = {"truth": truth, "n_geodesic": n_geodesic}
     rows, seconds = [], []
-    for one in outcomes.values():
-        found: dict[str, Any] = {"image": one.image, "reverse": one.reverse}
-        M, N = both.source.mesh, both.target.mesh
-        rows.append(metrics.evaluate(M, N, one.match, **found, **options))
-        spent = {**one.seconds, BLOCKS[0]: load}
+    M, N = pair.source.mesh, pair.target.mesh
+    for outcome in outcomes.values():
+        options |= {"image": outcome.image, "reverse": outcome.reverse}
+        rows.append(metrics.evaluate(M, N, outcome.match, **options))
+        spent = {**outcome.seconds, BLOCKS[0]: load}
         seconds.append([spent.get(block, 0.0) for block in BLOCKS])
     table = xr.concat(rows, "algorithm", combine_attrs="drop_conflicts")
     table["block_seconds"] = variable("block_seconds", np.array(seconds)[:, None]).isel(pair=0)
-    least = min((len(one.fmap) for one in both.spectral.values()), default=both.k)
-    table.attrs |= note_on_k(both.k, least)
+    least = min((len(r.fmap) for r in pair.spectral.values()), default=pair.k)
+    table.attrs |= note_on_k(pair.k, least)
     return table.assign_coords(algorithm=list(methods), block=list(BLOCKS)), outcomes
 
 
@@ -419,14 +416,15 @@ def compare_collection(
     seed: int = 0,
     rng: RNG | None = None,
 ) -> xr.Dataset:
-    """Table 2: the collection in the space of SCALABLE and of RE-MATCH.
+    """Compare SCALABLE and RE-MATCH on a collection (Table 2).
 
-    Full resolution is reached the standard way and ours.
+    Full-resolution matches are computed by functional maps ("standard" in the paper) and by the
+    latent bases ("ours").
 
     Parameters
     ----------
     shapes : path, list of paths, dict or DataTree
-        As of :func:`s4a.read_shapes`, or what it gives.
+        As for :func:`s4a.read_shapes`, or its result.
     methods : sequence of str
         Some of :data:`COLLECTION_METHODS`.
     n_coarse, n_pairs, k_init, k, step, seed, rng
@@ -435,31 +433,33 @@ def compare_collection(
         ``"paper"`` sets init="landmarks", n_samples=0 and dense_iterations=0; another value of
         these is refused.
     init, n_samples, dense_iterations
-        Initial maps, those of nearest neighbours after alignment by default, and Consistent
-        ZoomOut, see :func:`s4a.analyse`.
+        Options of the initial maps and of Consistent ZoomOut, see :func:`s4a.analyse`.
 
     Returns
     -------
     Dataset
         ``collection_chamfer(algorithm, dense_match, shape)``, eq. 9 between each shape and the
         image of the median shape, the template, as a share of sqrt(area), NaN for the template;
-        ``collection_seconds(algorithm, dense_match, block)``, CPU seconds of one core, full
-        resolution alone differing by ``dense_match``; ``median_shape(algorithm)`` and
-        ``distance_to_limit(algorithm, shape)``.  The attribute ``note`` says where k had to be
-        reduced.
+        ``collection_seconds(algorithm, dense_match, block)``, CPU seconds of one core;
+        ``median_shape(algorithm)`` and ``distance_to_limit(algorithm, shape)``.  The attribute
+        ``note`` names methods with a reduced k.
 
     Raises
     ------
     ValueError
-        When a method is unknown or fewer than 2 shapes can be used.
+        If a method is unknown or fewer than 2 shapes can be used.
+
+    See Also
+    --------
+    compare : Table 1, for pairs.
 
     Examples
     --------
     >>> import s4a
     >>> brains = s4a.synthetic.brains(6, 200)
     >>> options = {"n_coarse": 100, "n_pairs": 6, "k_init": 6, "k": 10}
-    >>> found = s4a.compare_collection(brains, methods=["RE-MATCH"], **options)
-    >>> found["collection_chamfer"].dims
+    >>> table = s4a.compare_collection(brains, methods=["RE-MATCH"], **options)
+    >>> table["collection_chamfer"].dims
     ('algorithm', 'dense_match', 'shape')
     """
     check_some(methods, COLLECTION_METHODS)
@@ -480,20 +480,20 @@ def compare_collection(
         raise ValueError(f"a collection needs at least 2 shapes, found {len(meshes)}")
     with threadpool_limits(1):
         bar = tqdm(methods, desc="collection")
-        rows = [one_collection(meshes, way, load, options) for way in bar]
-    notes = {way: row.attrs.pop("note", "") for way, row in zip(methods, rows, strict=True)}
+        rows = [run_collection(meshes, method, load, options) for method in bar]
+    notes = {m: row.attrs.pop("note", "") for m, row in zip(methods, rows, strict=True)}
     table = xr.concat(rows, "algorithm").assign_coords(algorithm=list(methods))
-    return table.assign_attrs(told(notes))
+    return table.assign_attrs(joint_note(notes))
 
 
-def one_collection(
-    meshes: dict[str, xr.Dataset], way: str, load: float, options: Options
+def run_collection(
+    meshes: dict[str, xr.Dataset], method: str, load: float, options: Options
 ) -> xr.Dataset:
-    """One row of Table 2."""
+    """Compute one row of Table 2."""
     names, clock = list(meshes), Clock()
     begin = time.process_time()
     spaces = [Spaces(mesh, options.n_coarse, options.k, options.seed) for mesh in meshes.values()]
-    shapes = [space.local if way == "SCALABLE" else space.coarse for space in spaces]
+    shapes = [space.local if method == "SCALABLE" else space.coarse for space in spaces]
     bases = [shape.low for shape in shapes]
     k = min(options.k, *(basis.k for basis in bases))
     source, target, maps = initial_maps(bases, options)
@@ -506,11 +506,11 @@ def one_collection(
     }
     ends = source, target, k
     *_, Y, low = clock("latent", latent.consistent_zoomout, bases, maps, *ends, **growth)
-    found = dataset(latent_basis=Y, latent_eigenvalue=low).assign_coords(shape=names)
+    result = dataset(latent_basis=Y, latent_eigenvalue=low).assign_coords(shape=names)
     spectra = np.stack([basis.eigenvalue[:k] for basis in bases])
-    found = clock("latent", median.median_shape, found, spectra)
+    result = clock("latent", median.median_shape, result, spectra)
     shared.append(clock["latent"])
-    template = names.index(found.attrs["median"])
+    template = names.index(result.attrs["median"])
     chamfer, full = zip(
         *(chamfer_to_template(spaces, shapes, Y, template, how) for how in DENSE_MATCHES),
         strict=True,
@@ -522,7 +522,7 @@ def one_collection(
     }
     table = xr.Dataset(
         {name: variable(name, values[None]).isel(algorithm=0) for name, values in measures.items()}
-        | {"distance_to_limit": found["distance_to_limit"].variable},
+        | {"distance_to_limit": result["distance_to_limit"].variable},
         attrs=note_on_k(options.k, k),
     )
     return table.assign_coords(
@@ -531,13 +531,13 @@ def one_collection(
 
 
 def initial_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Initial maps of a network, both ways: sources and targets ``(p,)``, maps ``(p, k, k)``."""
+    """Compute initial maps of a network: sources and targets ``(p,)``, maps ``(p, k, k)``."""
     k_init = min(options.k_init, *(basis.k for basis in bases))
     distance = network.spectral_distance([basis.eigenvalue[:k_init] for basis in bases])
     reference = bases[int(np.argmin(distance.sum(1)))]
-    still = np.eye(3), np.zeros(3)
+    identity = np.eye(3), np.zeros(3)
     transforms = [
-        still if M is reference else align(M.X, M.area, reference.X, reference.area)[:2]
+        identity if M is reference else align(M.X, M.area, reference.X, reference.area)[:2]
         for M in bases
     ]
     settings: dict[str, Any] = {"k_init": k_init, "init": options.init}
@@ -555,7 +555,7 @@ def initial_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.n
 def chamfer_to_template(
     spaces: list[Spaces], shapes: list[Shape], Y: np.ndarray, template: int, dense_match: str
 ) -> tuple[np.ndarray, float]:
-    """Eq. 9 of each shape and the image of the template ``(n,)``, NaN for it; CPU seconds."""
+    """Return eq. 9 of each shape and the image of the template ``(n,)``, and CPU seconds."""
     chamfer = np.full(len(shapes), np.nan)
     seconds = 0.0
     for i, (space, shape) in enumerate(zip(spaces, shapes, strict=True)):

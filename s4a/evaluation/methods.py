@@ -1,12 +1,11 @@
-"""The methods that 5.2 and 5.3 compare, each as a shape of its own functions, timed by block.
+"""Methods compared in 5.2 and 5.3, with CPU seconds by block.
 
-Every method works on a :class:`s4a.method.shape.Shape`: ZO and FMAP+ZO on one whose functions are
-the eigenfunctions of the dense mesh, SCALABLE on that of :mod:`s4a.method.scalable`, RE-MATCH on
-the coarse mesh with U Phi, as in the paper.  Ours are RE-MATCH refined, with functions of
-:mod:`s4a.method.refined_eigenfunctions`, and registered, which is RE-MATCH and the registration of
-:mod:`s4a.method.register` after it; its image are the matched vertices, as of all, and that of
-registered surface is the smooth surface on which they were looked up, which lies between them.
-Times are CPU seconds of one core, so that a busy machine changes them little.
+Every method works on a :class:`s4a.method.shape.Shape`: ZO and FMAP+ZO with the eigenfunctions of
+the dense mesh, SCALABLE with those of :mod:`s4a.method.scalable`, RE-MATCH with U Phi of the coarse
+mesh, as in the paper.  S4A adds RE-MATCH refined, with the functions of
+:mod:`s4a.method.refined_eigenfunctions`; registered, the matched vertices after the registration of
+:mod:`s4a.method.register`; and registered surface, the smooth registered surface itself.  Times are
+CPU seconds of one core, so other processes hardly affect them.
 """
 
 import time
@@ -40,15 +39,15 @@ from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import eigenpairs, spectrum
 
 PAPER_METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH")
-OUR_METHODS = ("RE-MATCH refined", "registered", "registered surface")
-METHODS = (*PAPER_METHODS, *OUR_METHODS)
-# the shape of Spaces whose functions a method compares; registration begins with RE-MATCH's match
+S4A_METHODS = ("RE-MATCH refined", "registered", "registered surface")
+METHODS = (*PAPER_METHODS, *S4A_METHODS)
+# attribute of Spaces with the functions of a method; registration begins with RE-MATCH
 KINDS = {"ZO": "dense", "FMAP+ZO": "dense", "SCALABLE": "local", "RE-MATCH": "coarse"}
 KINDS |= {"RE-MATCH refined": "refined", "registered": "coarse", "registered surface": "coarse"}
-# of Fig. 3
+# blocks of Fig. 3
 BLOCKS = ("load and clean", "align", "sample", "basis", "map", "refine", "full resolution")
-N_SAMPLES = 3000  # points of each shape by which it is aligned, and that group dense searches
-INITS = ("landmarks", "descriptors")  # fits of initial maps
+N_SAMPLES = 3000  # samples of each shape for alignment and for grouping dense searches
+INITS = ("landmarks", "descriptors")  # kinds of initial maps
 
 Matches = tuple[np.ndarray, np.ndarray]
 
@@ -62,24 +61,24 @@ class Clock(defaultdict[str, float]):
     def __call__(
         self, block: str, function: Callable[..., Any], *arguments: Any, **options: Any
     ) -> Any:
-        """What a function gives; its seconds go to the block."""
+        """Call a function, add its seconds to the block, and return its result."""
         begin = time.process_time()
         result = function(*arguments, **options)
         self[block] += time.process_time() - begin
         return result
 
     def add(self, seconds: Mapping[str, float]) -> None:
-        """Seconds that were spent on some blocks, once more perhaps."""
+        """Add seconds to the blocks."""
         for block, spent in seconds.items():
             self[block] += spent
 
 
 @dataclass
 class Spaces:
-    """A clean mesh and the shapes that the methods make of it, each made once.
+    """Clean mesh and the shapes that the methods need, each computed once.
 
-    Of a mesh with too few vertices for k functions they have as many as it can carry.  ``clock``
-    holds what was spent on the ``sample`` and the ``basis`` of each.
+    A mesh with too few vertices for k functions has fewer.  ``clock`` has the seconds for the
+    ``sample`` and the ``basis`` of each shape.
     """
 
     mesh: xr.Dataset
@@ -94,11 +93,11 @@ class Spaces:
         return Shape(self.mesh).to_frame(self.mesh["position"].values)
 
     @cached_property
-    def spread(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Spread points ``(p, 3)``, their areas of sum 1, and the nearest to every vertex."""
-        return self.clock("spread", self._spread)
+    def samples(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Samples ``(p, 3)``, their areas, which sum to 1, and the nearest one of each vertex."""
+        return self.clock("samples", self._samples)
 
-    def _spread(self):
+    def _samples(self):
         X, T = as_arrays(self.mesh)
         sample = farthest_points(self.X, N_SAMPLES)
         cell = cKDTree(self.X[sample]).query(self.X)[1]
@@ -107,7 +106,7 @@ class Spaces:
 
     @cached_property
     def dense(self) -> Shape:
-        """The mesh itself and its own first eigenfunctions; U is the identity."""
+        """Dense mesh and its first eigenfunctions; U is the identity."""
         return self.clock("dense basis", self._dense)
 
     def _dense(self):
@@ -115,29 +114,29 @@ class Spaces:
         E, w, area, _ = laplacian(X, T, vertex_areas(X, T))
         eigenvalue, Phi = eigenpairs(E, w, area, min(self.k, len(X) - 2))
         basis = Basis(self.X, T, area / area.sum(), Phi, eigenvalue)
-        return Shape.of(self.mesh, low=basis, full=basis, U=None, cell=self.spread[2])
+        return Shape.of(self.mesh, low=basis, full=basis, U=None, cell=self.samples[2])
 
     @cached_property
     def local(self) -> Shape:
-        """The samples of SCALABLE and its local functions."""
-        parts = self.clock("local sample", local_space, self.mesh, self.n_coarse, self.seed)
-        k = min(self.k, len(parts[0]) - 2)
-        return self.clock("local basis", spectral_space, self.mesh, *parts, k)
+        """Samples and local functions of SCALABLE."""
+        space = self.clock("local sample", local_space, self.mesh, self.n_coarse, self.seed)
+        k = min(self.k, len(space[0]) - 2)
+        return self.clock("local basis", spectral_space, self.mesh, *space, k)
 
     @cached_property
     def sampled(self) -> xr.Dataset:
-        """The low-resolution mesh."""
+        """Low-resolution mesh."""
         options = {"n_coarse": self.n_coarse, "seed": self.seed}
         return self.clock("remeshed sample", coarsen, self.mesh, **options)
 
     @cached_property
     def coarse(self) -> Shape:
-        """The low-resolution mesh and its own eigenfunctions: U Phi at all vertices."""
+        """Low-resolution mesh and its eigenfunctions, U Phi at all vertices."""
         return Shape(self.mesh, self.clock("coarse basis", spectrum, self.sampled, k=self.k))
 
     @cached_property
     def refined(self) -> Shape:
-        """The low-resolution mesh with functions that were brought to all vertices and back."""
+        """Low-resolution mesh with refined eigenfunctions."""
         return Shape(self.mesh, self.clock("refined basis", self._refined))
 
     def _refined(self):
@@ -147,7 +146,7 @@ class Spaces:
 
 
 def functions_at_all_vertices(shape: Shape, C: np.ndarray | None = None) -> np.ndarray:
-    """The functions of a shape, or Phi C^T, at all its vertices ``(n, k)``."""
+    """Return the functions of a shape, or Phi C^T, at all its vertices ``(n, k)``."""
     Phi = shape.full.Phi
     F = Phi if C is None else Phi[:, : C.shape[1]] @ C.T.astype(Phi.dtype)
     return shape.full.extend(F)
@@ -156,14 +155,14 @@ def functions_at_all_vertices(shape: Shape, C: np.ndarray | None = None) -> np.n
 def match_in_space(
     source: Spaces, target: Spaces, transform: tuple[np.ndarray, np.ndarray]
 ) -> Matches:
-    """kNN: nearest neighbours of the aligned shapes in space, for the target and for the source."""
+    """Match aligned shapes by nearest neighbours in space (kNN), in both directions."""
     R, t = transform
     moved = source.X @ R.T + t
     return cKDTree(moved).query(target.X)[1], cKDTree(target.X).query(moved)[1]
 
 
 def at_low_resolution(M: Shape, N: Shape, landmarks: Matches) -> list[np.ndarray]:
-    """Landmarks as vertices of low resolution, where there is one."""
+    """Return landmarks as vertices of the low-resolution shapes, if there are any."""
     return [
         mark if shape.U is None else shape.cell[mark]
         for shape, mark in zip((M, N), landmarks, strict=True)
@@ -171,20 +170,20 @@ def at_low_resolution(M: Shape, N: Shape, landmarks: Matches) -> list[np.ndarray
 
 
 def fit_map(M: Shape, N: Shape, landmarks: Matches, k: int) -> np.ndarray:
-    """Initial map ``(k, k)`` from landmarks and wave kernels, see `fmap.fmap_from_descriptors`."""
+    """Fit the initial map ``(k, k)`` to wave kernels, see :func:`fmap.fmap_from_descriptors`."""
     at_source, at_target = at_low_resolution(M, N, landmarks)
     bases = [replace(shape.low, area=shape.low.area / shape.low.area.sum()) for shape in (M, N)]
     return fmap.fmap_from_descriptors(*bases, k=k, landmarks=(at_source, at_target), oriented=0)
 
 
 class Outcome(NamedTuple):
-    """One method on one pair; a spectral one also has its maps, and the functions behind them."""
+    """Result of one method on one pair; spectral methods also have maps and functions."""
 
     match: np.ndarray  # (n_target,)
-    image: np.ndarray | None  # (n_target, 3), where the method gives more than vertices
-    reverse: Any  # (n_source,), the match the other way
+    image: np.ndarray | None  # (n_target, 3), if the method gives positions between vertices
+    reverse: Any  # (n_source,), match in the other direction
     seconds: dict[str, float]
-    first: np.ndarray | None = None  # (k_init, k_init), the initial map
+    initial: np.ndarray | None = None  # (k_init, k_init), the initial map
     fmap: Any = None  # (k, k), the refined one
     functions: Any = None  # at all vertices, of source and target
     low_match: Any = None  # (n_low_target,)
@@ -192,19 +191,19 @@ class Outcome(NamedTuple):
 
 @dataclass
 class Pair:
-    """Two meshes on which methods are run; what several share is made once and charged to each.
+    """Pair of meshes for all methods; shared results are computed once and charged to each.
 
     Parameters
     ----------
     source, target : Spaces
     landmarks : tuple of int ndarray, optional
-        Corresponding vertices; by default those of 4.1, step 3.
+        Corresponding vertices; by default as in 4.1, step 3.
     k_init, k, step : int
-        Of the maps.
+        Sizes and growth of the maps.
     full_resolution_iterations : int
-        Last iterations of RE-MATCH refined that look among all vertices.
+        Final iterations of RE-MATCH refined that search all vertices.
     init : {"landmarks", "descriptors"}
-        Initial maps as :func:`s4a.method.fmap.fmap_from_landmarks`, or from wave kernels of the
+        Initial maps by :func:`s4a.method.fmap.fmap_from_landmarks`, or from wave kernels of the
         shapes and around landmarks.
     """
 
@@ -219,7 +218,7 @@ class Pair:
     spectral: dict[str, Outcome] = field(default_factory=dict)
 
     def run(self, method: str) -> Outcome:
-        """A method of :data:`METHODS`."""
+        """Run a method of :data:`METHODS`."""
         clock = Clock()
         remeshed = KINDS.get(method) in ("coarse", "refined")
         transform, landmarks, align_seconds = (
@@ -230,8 +229,8 @@ class Pair:
         if aligned:
             clock["align"] += align_seconds
         if not remeshed and (aligned or method == "FMAP+ZO"):
-            # spread points align, and group the searches of the dense methods
-            spent = sum(end.clock["spread"] for end in (self.source, self.target))
+            # samples are used for alignment and for grouping dense searches
+            spent = sum(end.clock["samples"] for end in (self.source, self.target))
             clock["align" if aligned else "refine"] += spent
         if method == "kNN":
             ends = self.source, self.target
@@ -240,28 +239,28 @@ class Pair:
         spectral = self.match_spectrally("RE-MATCH" if registers else method, transform, landmarks)
         clock.add(spectral.seconds)
         if registers:
-            found = self.registered
-            clock.add(found.seconds)
-            image = found.image if method == "registered surface" else None
-            return found._replace(image=image, seconds=clock)
+            outcome = self.registered
+            clock.add(outcome.seconds)
+            image = outcome.image if method == "registered surface" else None
+            return outcome._replace(image=image, seconds=clock)
         M, N = self.shapes(method)
         F, G = spectral.functions
         return spectral._replace(reverse=nearest_in_cells(F, M.cell, G, N.cell)[0], seconds=clock)
 
     def shapes(self, method: str) -> tuple[Shape, Shape]:
-        """Source and target in the functions of a method."""
+        """Return source and target with the functions of a method."""
         kind = KINDS[method]
         return getattr(self.source, kind), getattr(self.target, kind)
 
     @cached_property
     def align_samples(self) -> tuple[RigidTransform, Matches, float]:
-        """RigidTransform and landmarks by spread points of both, and the seconds that they took."""
-        (X, area, _), (Y, area_target, _) = self.source.spread, self.target.spread
+        """Rigid transform and landmarks from samples of both shapes, and the seconds spent."""
+        (X, area, _), (Y, area_target, _) = self.source.samples, self.target.samples
         return self._align(X, area, Y, area_target)
 
     @cached_property
     def align_remeshed(self) -> tuple[RigidTransform, Matches, float]:
-        """The same by the low-resolution meshes."""
+        """Rigid transform and landmarks from the low-resolution meshes, and the seconds spent."""
         M, N = self.source.coarse.low, self.target.coarse.low
         return self._align(M.X, M.area, N.X, N.area)
 
@@ -278,7 +277,7 @@ class Pair:
     def match_spectrally(
         self, method: str, transform: RigidTransform, landmarks: Matches
     ) -> Outcome:
-        """A method of functions: initial map, ZoomOut and match at full resolution."""
+        """Run a spectral method: initial map, ZoomOut and match at full resolution."""
         if method not in self.spectral:
             self.spectral[method] = self._match_spectrally(method, transform, landmarks)
         return self.spectral[method]
@@ -310,10 +309,10 @@ class Pair:
             "dense": lambda Q, D: nearest_in_cells(Q, N.cell, D, M.cell)[0],
             "local": nearest_rows,
             "coarse": nearest_rows,
-            # other searches follow, so that near ties do not matter
+            # later searches make near ties irrelevant
             "refined": lambda Q, D: nearest_float32(as_queries(Q), as_candidates(D)),
         }[kind]
-        first, options = C, {"step": self.step, "nearest": nearest}
+        initial, options = C, {"step": self.step, "nearest": nearest}
         C, low_match = clock("refine", fmap.zoomout, M.low, N.low, C, k, **options)
         if kind == "refined":
             for _ in range(self.full_resolution_iterations):
@@ -323,19 +322,19 @@ class Pair:
         match = low_match
         if kind != "dense":
             match, *_ = clock("full resolution", nearest_in_cells, G, N.cell, F, M.cell)
-        return Outcome(match, None, None, clock, first, C, (F, G), low_match)
+        return Outcome(match, None, None, clock, initial, C, (F, G), low_match)
 
     @cached_property
     def registered(self) -> Outcome:
-        """Registration by default after RE-MATCH; its image is the registered surface."""
+        """Default registration after RE-MATCH; the image is the registered surface."""
         clock = Clock()
         M, N = self.shapes("registered")
         transform, landmarks, _ = self.align_remeshed
         spectral = self.match_spectrally("RE-MATCH", transform, landmarks)
         icp = nearest_after_alignment(M.low, N.low, transform)
-        starts = {"intrinsic": spectral.low_match, "icp": icp}
-        tried = clock("refine", find_candidates, M, N, starts, k=len(spectral.fmap))
-        ends = M, N, tried, spectral.functions
+        initialisations = {"intrinsic": spectral.low_match, "icp": icp}
+        candidates = clock("refine", find_candidates, M, N, initialisations, k=len(spectral.fmap))
+        ends = M, N, candidates, spectral.functions
         match, moved, _ = clock("full resolution", register_surface, *ends, elastic=True)
         reverse = match_surfaces(M.full.X, M.full.normals, moved.X, moved.normals)
         return Outcome(match, M.from_frame(moved.X), reverse, clock)

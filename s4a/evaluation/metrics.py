@@ -1,9 +1,7 @@
-"""Metrics of a correspondence.
+"""Metrics of a correspondence: those of the paper (5.1, eq. 9-11), and errors of a map.
 
-Those of the paper (5.1, eq. 9-11), and those that can see a wrong map.
-
-The plain functions take arrays in any one unit; :func:`evaluate` scales the surfaces to unit area,
-so that its lengths are shares of sqrt(area).
+The plain functions take arrays in any unit; :func:`evaluate` scales the surfaces to unit area, so
+its lengths are shares of sqrt(area).
 """
 
 from typing import Any
@@ -29,26 +27,26 @@ from s4a.schema import dataset, require
 THRESHOLDS = np.linspace(0, 0.25, 101)  # of the error curve, as in Kim et al. (2011), Fig. 6
 
 
-def gaps(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances to the nearest point, both ways: ``(n,)`` from X to Y, ``(p,)`` from Y to X."""
+def nearest_distances(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances to the nearest point: ``(n,)`` from X to Y, ``(p,)`` from Y to X."""
     return cKDTree(Y).query(X)[0], cKDTree(X).query(Y)[0]
 
 
 def chamfer(X: np.ndarray, Y: np.ndarray) -> float:
-    """Chamfer distance of two sets of points (eq. 9).
+    """Chamfer distance of two point sets (eq. 9).
 
-    Mean distance to the nearest point, both ways, summed.
+    Sum of the mean distances to the nearest point in both directions.
 
-    It sees how much of one set is far from the other.  It cannot see which point goes where: any
-    permutation of the vertices scores 0.  Vertices that nothing is matched to count only as far as
-    their neighbours are away.
+    It sees how much of one set is far from the other.  It cannot see which point is matched to
+    which: any permutation of the vertices scores 0.  Vertices without a match count only by the
+    distance to their neighbours.
 
     Parameters
     ----------
     X : float ndarray (n, 3)
         Vertices of M.
     Y : float ndarray (p, 3)
-        Their counterpart: the image of N under the map.
+        Image of N under the map.
 
     Returns
     -------
@@ -61,20 +59,20 @@ def chamfer(X: np.ndarray, Y: np.ndarray) -> float:
     >>> s4a.metrics.chamfer(np.zeros((2, 3)), np.array([[3.0, 4.0, 0.0]]))
     10.0
     """
-    return float(sum(gap.mean() for gap in gaps(X, Y)))
+    return float(sum(distance.mean() for distance in nearest_distances(X, Y)))
 
 
 def hausdorff(X: np.ndarray, Y: np.ndarray, formula: str = "standard") -> float:
-    """Hausdorff distance of two sets of points (eq. 10): the largest distance to the nearest point.
+    """Hausdorff distance of two point sets (eq. 10): largest distance to the nearest point.
 
-    It sees the worst place only, and like :func:`chamfer` no permutation.
+    It sees only the worst point, and like :func:`chamfer` it cannot see permutations.
 
     Parameters
     ----------
     X, Y : see :func:`chamfer`
     formula : {"standard", "paper"}
-        The larger of both ways; or eq. 10 as it is printed, where the second maximum is divided by
-        the number of points of Y and added: with thousands of points that is the first way alone.
+        The maximum over both directions; or eq. 10 as printed, where the second maximum is divided
+        by the number of points of Y and added, so that it hardly counts with thousands of points.
 
     Returns
     -------
@@ -83,7 +81,7 @@ def hausdorff(X: np.ndarray, Y: np.ndarray, formula: str = "standard") -> float:
     Raises
     ------
     ValueError
-        When the formula is another.
+        If the formula is unknown.
 
     Examples
     --------
@@ -95,30 +93,29 @@ def hausdorff(X: np.ndarray, Y: np.ndarray, formula: str = "standard") -> float:
     """
     if formula not in ("standard", "paper"):
         raise ValueError(f"formula must be 'standard' or 'paper', found {formula!r}")
-    forth, back = (gap.max() for gap in gaps(X, Y))
+    forth, back = (distance.max() for distance in nearest_distances(X, Y))
     return float(max(forth, back) if formula == "standard" else forth + back / len(Y))
 
 
 def dirichlet(f: np.ndarray, E: np.ndarray, w: np.ndarray) -> float:
-    """Dirichlet energy f^T A L f of functions on the vertices (eq. 11), summed over the functions.
+    """Dirichlet energy f^T A L f of functions on the vertices (eq. 11), summed over functions.
 
     With L = A^-1 W it is f^T W f, the sum of w (f_i - f_j)^2 over the edges: the areas cancel, and
-    so does the scale of the mesh that carries f.  Of the coordinates of an image it is at least
-    twice the area of the image, and exactly that for a conformal map; of an eigenfunction it is its
-    eigenvalue.
+    so does the scale of the mesh.  For the coordinates of an image it is at least twice the area of
+    the image, with equality for a conformal map; for an eigenfunction it is the eigenvalue.
 
-    It sees how rough a map is.  It cannot see where it goes: a map of everything to one point
-    scores 0, and a smooth map to the wrong side scores as well as the right one.
+    It sees how rough a map is.  It cannot see its target: a map to one point scores 0, and a smooth
+    map to the wrong side scores like the correct one.
 
     Parameters
     ----------
     f : float ndarray (n,) or (n, d)
-        Functions on the vertices of the mesh that carries them: coordinates of the image, or
-        eigenfunctions ``Phi[match]`` carried over a map.
+        Functions on the vertices of a mesh: coordinates of the image, or transferred eigenfunctions
+        ``Phi[match]``.
     E : int ndarray (e, 2)
         Edges of that mesh.
     w : float ndarray (e,)
-        Their cotan weights, see :func:`s4a.geometry.mesh.cotan_weights`.
+        Cotangent weights, see :func:`s4a.geometry.mesh.cotan_weights`.
 
     Returns
     -------
@@ -138,31 +135,33 @@ def dirichlet(f: np.ndarray, E: np.ndarray, w: np.ndarray) -> float:
 
 
 def geodesic_error(
-    X: np.ndarray, T: np.ndarray, found: np.ndarray, true: np.ndarray, *, limit: float = 1.0
+    X: np.ndarray, T: np.ndarray, match: np.ndarray, true: np.ndarray, *, limit: float = 1.0
 ) -> np.ndarray:
-    """Distances from true to found vertices along the edges, as shares of sqrt(area).
+    """Return distances from true to matched vertices along edges, as shares of sqrt(area).
 
-    Cut at `limit`.
-
-    The Princeton protocol (Kim, Lipman, Funkhouser 2011) with paths along edges, which are up to a
-    tenth longer than the shortest ones.  It sees every wrong vertex, and how far off it is.  It
-    cannot see anything finer than the vertices lie apart, and not whether neighbours stay
-    neighbours.
+    Princeton protocol with paths along edges, which are up to 10 % longer than geodesics.  It sees
+    every wrong vertex and its error.  It cannot see errors below the vertex spacing, nor whether
+    neighbours stay neighbours.
 
     Parameters
     ----------
-    X, T : the mesh that found and true vertices belong to
-    found, true : int ndarray (p,)
+    X, T : mesh of the matched and true vertices
+    match, true : int ndarray (p,)
     limit : float
+        Largest distance.
 
     Returns
     -------
     float ndarray (p,)
-        `limit` where there is no path, or none as short.
+        `limit` if there is no shorter path.
+
+    References
+    ----------
+    V. Kim, Y. Lipman and T. Funkhouser (2011), Blended intrinsic maps, ACM TOG 30(4).
 
     Examples
     --------
-    A square of area 1, in two triangles; one vertex of four is a side's length off:
+    A square of area 1 with one of four vertices matched to its neighbour:
 
     >>> import numpy as np
     >>> import s4a
@@ -172,16 +171,15 @@ def geodesic_error(
     [0.0, 0.0, 0.0, 1.0]
     """
     return path_lengths(
-        edge_graph(X / np.sqrt(triangle_areas(X, T).sum()), edges(T)), true, found, limit
+        edge_graph(X / np.sqrt(triangle_areas(X, T).sum()), edges(T)), true, match, limit
     )
 
 
 def error_curve(error: np.ndarray, thresholds: ArrayLike = THRESHOLDS) -> np.ndarray:
-    """Share of the errors that are no larger than each threshold, ``(t,)``.
+    """Return the share of errors up to each threshold ``(t,)``.
 
-    It is the cumulative curve of the Princeton protocol.
-
-    It sees what a mean hides: few gross errors or many small ones.
+    The cumulative curve of the Princeton protocol distinguishes few gross errors from many small
+    ones, which a mean cannot.
 
     Examples
     --------
@@ -194,10 +192,10 @@ def error_curve(error: np.ndarray, thresholds: ArrayLike = THRESHOLDS) -> np.nda
 
 
 def coverage(match: np.ndarray, area: np.ndarray) -> float:
-    """Share of the source's area whose vertices are matched to by some vertex of the target.
+    """Return the share of the source's area whose vertices are matched by the target.
 
-    It sees a map that collapses.  It cannot see a wrong one: a random permutation scores 1.  With
-    fewer vertices on the target than on the source it stays below 1 for the best of maps.
+    It sees a map that collapses.  It cannot see a wrong map: a random permutation scores 1.  If the
+    target has fewer vertices than the source, it is below 1 for any map.
 
     Parameters
     ----------
@@ -221,25 +219,24 @@ def cycle_error(
     vertices: np.ndarray | None = None,
     limit: float = 1.0,
 ) -> np.ndarray:
-    """How far vertices are from where they started after a chain of matches that leads back.
+    """Return the distance of vertices from their images under a cycle of matches.
 
-    See `geodesic_error`.
-
-    It sees matches that contradict each other, without any truth.  It cannot see errors that
-    cancel: a symmetric flip there and back scores 0.
+    It sees inconsistent matches without ground truth.  It cannot see errors that cancel: a
+    symmetric flip and its inverse score 0.
 
     Parameters
     ----------
-    X, T : the mesh where the cycle starts and ends
+    X, T : mesh at which the cycle starts and ends
     *matches : int ndarray
-        The first holds on its vertices those of the next shape, and so on; the last holds vertices
-        of X.
+        The first match maps vertices of X to those of the next shape, and so on; the last maps to
+        vertices of X.
     vertices : int ndarray (p,), optional
-        Where to start; everywhere by default.
+        Vertices at which to start; by default all.
 
     Returns
     -------
     float ndarray (p,)
+        See :func:`geodesic_error`.
 
     Examples
     --------
@@ -247,8 +244,8 @@ def cycle_error(
     >>> import s4a
     >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])  # a square
     >>> T = np.array([[0, 1, 2], [0, 2, 3]])
-    >>> turn = np.array([1, 2, 3, 0])
-    >>> s4a.metrics.cycle_error(X, T, turn, turn, turn, turn).tolist()
+    >>> rotate = np.array([1, 2, 3, 0])
+    >>> s4a.metrics.cycle_error(X, T, rotate, rotate, rotate, rotate).tolist()
     [0.0, 0.0, 0.0, 0.0]
     """
     start = np.arange(len(X)) if vertices is None else vertices
@@ -267,13 +264,11 @@ def bijectivity(
     vertices: np.ndarray | None = None,
     limit: float = 1.0,
 ) -> np.ndarray:
-    """Round trip target -> source -> target, a :func:`cycle_error` of two matches.
-
-    0 for a map and its inverse.
+    """Return the :func:`cycle_error` target -> source -> target; 0 for a map and its inverse.
 
     Parameters
     ----------
-    X, T : the target
+    X, T : mesh of the target
     match : int ndarray (n_target,)
         Vertices of the source.
     reverse : int ndarray (n_source,)
@@ -291,25 +286,25 @@ def bijectivity(
     >>> import s4a
     >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])  # a square
     >>> T = np.array([[0, 1, 2], [0, 2, 3]])
-    >>> turn = np.array([1, 2, 3, 0])
-    >>> s4a.metrics.bijectivity(X, T, turn, np.argsort(turn)).tolist()
+    >>> rotate = np.array([1, 2, 3, 0])
+    >>> s4a.metrics.bijectivity(X, T, rotate, np.argsort(rotate)).tolist()
     [0.0, 0.0, 0.0, 0.0]
     """
     return cycle_error(X, T, match, reverse, vertices=vertices, limit=limit)
 
 
-def label_accuracy(found: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> float:
-    """Share of the vertices, or of the area, whose label is right.
+def label_accuracy(label: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> float:
+    """Return the share of the vertices, or of the area, with the correct label.
 
-    It sees gross errors only, as most vertices lie far from any border; :func:`dice` sees small
-    regions as well.
+    It sees gross errors only, as most vertices are far from any border; :func:`dice` also sees
+    small regions.
 
     Parameters
     ----------
-    found, true : array_like (n,)
+    label, true : array_like (n,)
         Labels, numbers or names.
     area : float ndarray (n,), optional
-        Weights of the vertices; all the same by default.
+        Weights of the vertices; equal by default.
 
     Examples
     --------
@@ -319,26 +314,25 @@ def label_accuracy(found: ArrayLike, true: ArrayLike, area: np.ndarray | None = 
     >>> s4a.metrics.label_accuracy(label, truth, area)
     0.75
     """
-    return float(np.average(np.asarray(found) == np.asarray(true), weights=area))
+    return float(np.average(np.asarray(label) == np.asarray(true), weights=area))
 
 
-def dice(found: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> dict[Any, float]:
-    """Dice's overlap 2 |A n B| / (|A| + |B|) of each label, by vertices or by area.
+def dice(label: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> dict[Any, float]:
+    """Return the Dice coefficient 2 |A n B| / (|A| + |B|) of each label, by vertices or area.
 
-    It sees each region, small ones as strictly as large ones.  It cannot see errors inside a
-    region.
+    It sees each region, small ones like large ones.  It cannot see errors inside a region.
 
     Parameters
     ----------
-    found, true : array_like (n,)
+    label, true : array_like (n,)
         Labels, numbers or names.
     area : float ndarray (n,), optional
-        Weights of the vertices; all the same by default.
+        Weights of the vertices; equal by default.
 
     Returns
     -------
     dict
-        Label -> overlap in 0..1, for every label of either.
+        Label -> Dice coefficient in 0..1, for every label of either array.
 
     Examples
     --------
@@ -348,23 +342,23 @@ def dice(found: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> d
     >>> [round(overlap[label], 3) for label in (1, 2)]
     [0.667, 0.667]
     """
-    found, true = np.asarray(found), np.asarray(true)
-    area = np.ones(len(found)) if area is None else area
+    label, true = np.asarray(label), np.asarray(true)
+    area = np.ones(len(label)) if area is None else area
     overlap = {}
-    for label in np.union1d(found, true).tolist():
-        here, there = found == label, true == label
-        both = 2 * area[here & there].sum()
-        overlap[label] = float(both / (area[here].sum() + area[there].sum()))
+    for value in np.union1d(label, true).tolist():
+        a, b = label == value, true == value
+        common = 2 * area[a & b].sum()
+        overlap[value] = float(common / (area[a].sum() + area[b].sum()))
     return overlap
 
 
-def landmark_error(found: ArrayLike, true: ArrayLike) -> np.ndarray:
-    """Straight distances of found to true landmarks ``(p,)``, in their unit.
+def landmark_error(position: ArrayLike, true: ArrayLike) -> np.ndarray:
+    """Return Euclidean distances of landmarks from the true ones ``(p,)``, in their unit.
 
-    It sees the map at a few places that an expert knows, with the expert's own error in it, and
+    It sees the map at a few points that an expert has marked, including the expert's error, and
     nowhere else.
     """
-    return np.linalg.norm(np.asarray(found) - np.asarray(true), axis=-1)
+    return np.linalg.norm(np.asarray(position) - np.asarray(true), axis=-1)
 
 
 def _weighted_median(values, weight):
@@ -376,14 +370,14 @@ def _weighted_median(values, weight):
 
 
 def true_positions(truth: ArrayLike, X: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Truth as of :func:`evaluate`, as positions and as vertices of the source.
+    """Convert ground truth of :func:`evaluate` to positions and to vertices of the source.
 
     Parameters
     ----------
     truth : array_like (n,) of integers, or (n, 3)
     X : float ndarray (n_source, 3)
     n : int
-        Vertices of the target.
+        Number of vertices of the target.
 
     Returns
     -------
@@ -395,7 +389,7 @@ def true_positions(truth: ArrayLike, X: np.ndarray, n: int) -> tuple[np.ndarray,
     Raises
     ------
     ValueError
-        When it is neither, or names a vertex that the source does not have.
+        If truth has another form, or refers to a vertex that the source lacks.
 
     Examples
     --------
@@ -424,7 +418,7 @@ def true_positions(truth: ArrayLike, X: np.ndarray, n: int) -> tuple[np.ndarray,
     return truth, vertex
 
 
-def _match_of(match, mesh, other, what):
+def _check_match(match, mesh, other, what):
     match = np.asarray(match)
     n, p = mesh.sizes["vertex"], other.sizes["vertex"]
     low, high = match.min(initial=0), match.max(initial=0)
@@ -436,8 +430,8 @@ def _match_of(match, mesh, other, what):
     return match
 
 
-def _some(n, most):
-    """At most so many of n rows, evenly spaced."""
+def _evenly_spaced(n, most):
+    """Return at most `most` of n rows, evenly spaced."""
     return np.unique(np.linspace(0, n - 1, min(most, n)).astype(int))
 
 
@@ -452,30 +446,28 @@ def evaluate(
     n_geodesic: int = 1000,
     thresholds: ArrayLike = THRESHOLDS,
 ) -> xr.Dataset:
-    """Every metric of a correspondence that the inputs allow, as scalars of a Dataset.
+    """Compute all metrics of a correspondence that the inputs allow.
 
-    Lengths are shares of sqrt(area) of the surface on which they are measured.
+    Lengths are shares of sqrt(area) of their surface.
 
     Parameters
     ----------
     source, target : Dataset
-        Meshes.  Where both have ``label``, and where both have landmarks of the same
-        ``landmark_name``, these are carried over and compared, too.
+        Meshes.  Labels, and landmarks of the same ``landmark_name``, are transferred and compared
+        if both meshes have them.
     match : int array_like (n_target,)
-        On each vertex of the target the matched vertex of the source.
+        Matched vertex of the source for each vertex of the target.
     image : float array_like (n_target, 3), optional
-        Positions on the source, in its frame and unit, where the method gives more than vertices;
-        by default the positions of the matched vertices.
+        Positions on the source, in its frame and unit; by default those of the matched vertices.
     reverse : int array_like (n_source,), optional
-        The match the other way.
+        Match in the other direction.
     truth : array_like, optional
-        True vertex of the source for every vertex of the target ``(n_target,)``, -1 where there is
-        none, or true position ``(n_target, 3)``, NaN where there is none.
+        True vertex of the source for each vertex of the target ``(n_target,)``, -1 if unknown, or
+        true position ``(n_target, 3)``, NaN if unknown.
     n_geodesic : int
-        On how many vertices of the target, evenly spaced in their order, distances are measured
-        along edges.
+        Number of vertices of the target, evenly spaced in their order, for geodesic distances.
     thresholds : array_like (t,)
-        Of the error curve.
+        Thresholds of the error curve.
 
     Returns
     -------
@@ -487,13 +479,17 @@ def evaluate(
         ``error_curve(threshold)``; with labels ``label_accuracy`` (by area) and ``label_dice``
         (mean over the labels of the target); with landmarks ``landmark_error`` (mean).
 
-        Several stack with ``xarray.concat``; ``way`` is a good name for the new dim, as
-        ``.sel(method=...)`` is taken by xarray itself.
+        Results stack with ``xarray.concat`` along a new dim, such as ``algorithm`` (``method`` is
+        a keyword of ``sel``).
 
     Raises
     ------
     ValueError
-        When the arrays do not fit the meshes.
+        If the arrays do not fit the meshes.
+
+    See Also
+    --------
+    s4a.compare : these metrics for several methods.
 
     Examples
     --------
@@ -501,16 +497,16 @@ def evaluate(
     >>> import s4a
     >>> ball = s4a.synthetic.sphere(162)
     >>> same = np.arange(162)
-    >>> found = s4a.metrics.evaluate(ball, ball, same, reverse=same, truth=same)
-    >>> float(found["coverage"]), float(found["geodesic_error"])
+    >>> result = s4a.metrics.evaluate(ball, ball, same, reverse=same, truth=same)
+    >>> float(result["coverage"]), float(result["geodesic_error"])
     (1.0, 0.0)
-    >>> round(float(found["dirichlet"]), 6)
+    >>> round(float(result["dirichlet"]), 6)
     2.0
     """
     for mesh, what in ((source, "source"), (target, "target")):
         require(mesh, "position", "corner_vertex", what=what)
     (X, T), (Y, S) = as_arrays(source), as_arrays(target)
-    match = _match_of(match, target, source, "match")
+    match = _check_match(match, target, source, "match")
     area, area_target = vertex_areas(X, T), vertex_areas(Y, S)
     size, size_target = np.sqrt(area.sum()), np.sqrt(area_target.sum())
     image = X[match] if image is None else np.asarray(image, float)
@@ -518,57 +514,57 @@ def evaluate(
         raise ValueError(
             f"image needs a position for each vertex of the target, {Y.shape}; found {image.shape}"
         )
-    forth, back = gaps(X / size, image / size)
+    forth, back = nearest_distances(X / size, image / size)
     conformal, growth = distortion(Y / size_target, image / size, S)
     weight = triangle_areas(Y, S)
-    kept, collapsed = np.isfinite(growth), np.isneginf(growth)
-    found = {
+    regular, collapsed = np.isfinite(growth), np.isneginf(growth)
+    result = {
         "chamfer": forth.mean() + back.mean(),
         "hausdorff": max(forth.max(), back.max()),
         "hausdorff_paper": forth.max() + back.max() / len(image),
         "dirichlet": dirichlet(image / size, *cotan_weights(Y, S)),
         "coverage": coverage(match, area),
-        "conformal_distortion": _weighted_median(conformal[kept], weight[kept]),
-        "area_distortion": _weighted_median(np.abs(growth[kept]), weight[kept]),
+        "conformal_distortion": _weighted_median(conformal[regular], weight[regular]),
+        "area_distortion": _weighted_median(np.abs(growth[regular]), weight[regular]),
         "collapsed_share": weight[collapsed].sum() / weight.sum(),
     }
     if reverse is not None:
-        reverse = _match_of(reverse, source, target, "reverse")
-        sample = _some(len(Y), n_geodesic)
-        found["bijectivity"] = bijectivity(Y, S, match, reverse, vertices=sample).mean()
+        reverse = _check_match(reverse, source, target, "reverse")
+        sample = _evenly_spaced(len(Y), n_geodesic)
+        result["bijectivity"] = bijectivity(Y, S, match, reverse, vertices=sample).mean()
     coords = {}
     if truth is not None:
         position, vertex = true_positions(truth, X, len(Y))
         known = np.flatnonzero(vertex >= 0)
         if not len(known):
             raise ValueError(
-                "truth is unknown at every vertex of the target; leave it out, or give some"
+                "truth is unknown at every vertex of the target; give at least one, or leave it out"
             )
-        some = known[_some(len(known), n_geodesic)]
-        error = geodesic_error(X, T, match[some], vertex[some])
-        found |= {
+        sample = known[_evenly_spaced(len(known), n_geodesic)]
+        error = geodesic_error(X, T, match[sample], vertex[sample])
+        result |= {
             "geodesic_error": error.mean(),
             "euclidean_error": np.linalg.norm(image[known] - position[known], axis=1).mean() / size,
             "error_curve": error_curve(error, thresholds),
         }
         coords["threshold"] = np.asarray(thresholds, float)
     if "label" in source and "label" in target:
-        carried, true = source["label"].values[match], target["label"].values
-        overlap = dice(carried, true, area_target)
-        found["label_accuracy"] = label_accuracy(carried, true, area_target)
-        found["label_dice"] = np.mean([overlap[label] for label in np.unique(true).tolist()])
+        label, true = source["label"].values[match], target["label"].values
+        overlap = dice(label, true, area_target)
+        result["label_accuracy"] = label_accuracy(label, true, area_target)
+        result["label_dice"] = np.mean([overlap[value] for value in np.unique(true).tolist()])
     if "landmark_name" in source and "landmark_name" in target:
-        ours, theirs = map(_landmarks, (source, target))
-        shared = [name for name in theirs if name in ours]
+        at_source, at_target = map(_landmarks, (source, target))
+        shared = [name for name in at_target if name in at_source]
         if shared:
-            place = closest_point(np.array([theirs[name] for name in shared]), Y, S)
-            true = np.array([ours[name] for name in shared])
-            error = landmark_error(interpolate(image, S, *place), true)
-            found["landmark_error"] = error.mean() / size
-    return dataset(**found).assign_coords(coords)
+            point = closest_point(np.array([at_target[name] for name in shared]), Y, S)
+            true = np.array([at_source[name] for name in shared])
+            error = landmark_error(interpolate(image, S, *point), true)
+            result["landmark_error"] = error.mean() / size
+    return dataset(**result).assign_coords(coords)
 
 
 def _landmarks(mesh):
-    """The positions of a mesh's landmarks by name."""
+    """Return the positions of a mesh's landmarks by name."""
     names = mesh["landmark_name"].values.tolist()
     return dict(zip(names, mesh["landmark_position"].values, strict=True))

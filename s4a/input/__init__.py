@@ -1,4 +1,4 @@
-"""From files to clean meshes and tables of subjects (5, the data)."""
+"""Read, clean and check meshes, annotations and tables of subjects (5, the data)."""
 
 from pkgutil import iter_modules
 

@@ -45,7 +45,7 @@ def mirror_image(mesh: xr.Dataset) -> xr.Dataset:
             image[name] = mesh[name].copy(data=mesh[name].values[:, ::-1])
     flipped = np.ascontiguousarray(mesh["corner_vertex"].values[:, ::-1])
     image["corner_vertex"] = mesh["corner_vertex"].copy(data=flipped)
-    reasons = [mesh.attrs.get("reason", ""), "mirrored, as reflect= says"]
+    reasons = [mesh.attrs.get("reason", ""), "mirrored by reflect="]
     reflected = 1 - mesh.attrs.get("reflected", 0)
     return image.assign_attrs(reflected=reflected, reason="; ".join(filter(None, reasons)))
 
@@ -159,7 +159,7 @@ def is_mirrored(
     ----------
     name : str
     comparison : Dataset
-        Of :func:`s4a.input.plausibility.compare`.
+        See :func:`s4a.input.plausibility.compare`.
     others : dict of str to Dataset
         Comparisons of the other shapes.
     """

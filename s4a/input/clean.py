@@ -71,7 +71,7 @@ def clean(
 
     Vertices within 1e-7 of the bounding-box diagonal are welded.  Degenerate and duplicate
     triangles are dropped, and zero-area triangles are removed by flipping their long edge.
-    Non-manifold edges and vertices are split [1]_, triangles are oriented consistently and
+    Non-manifold edges and vertices are split, triangles are oriented consistently and
     outwards, and small components are dropped.  Holes are kept unless `close_holes` is set.
 
     Parameters
@@ -105,8 +105,8 @@ def clean(
 
     References
     ----------
-    .. [1] A. Guéziec, G. Taubin, F. Lazarus, W. Horn, "Cutting and stitching: converting sets of
-       polygons to manifold surfaces", IEEE TVCG 7(2), 2001.
+    A. Guéziec, G. Taubin, F. Lazarus and W. Horn (2001), Cutting and stitching: converting sets of
+    polygons to manifold surfaces, IEEE TVCG 7(2).
 
     Examples
     --------
@@ -566,12 +566,12 @@ def _pairs_around_edges(P, F, group, edge_of, count):
     """
     order = counting_order(edge_of, len(count))
     start_of_edge = np.cumsum(count) - count
-    pairs = [np.empty((0, 2), np.int64)]
+    blocks = [np.empty((0, 2), np.int64)]
     for k in range(3, _MOST_AROUND_EDGE + 1):
         around = order[start_of_edge[count == k][:, None] + np.arange(k)]  # (edges, k) half-edges
-        pairs += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
-    pair = np.concatenate(pairs)
-    h, g = pair.T
+        blocks += [around[:, [i, j]] for i in range(k) for j in range(i + 1, k)]
+    pairs = np.concatenate(blocks)
+    h, g = pairs.T
     m = len(F)
     normal = triangle_normals(P, F)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -582,7 +582,7 @@ def _pairs_around_edges(P, F, group, edge_of, count):
     corner = F.T.ravel()
     towards = P[corner[(g + 2 * m) % (3 * m)]] - P[corner[h]]  # to the third corner of the mate
     convex = np.einsum("ij,ij->i", normal[h % m], towards) < 0
-    return pair, np.round(1 - cos, 6) + 4 * twisted - 1e-7 * convex
+    return pairs, np.round(1 - cos, 6) + 4 * twisted - 1e-7 * convex
 
 
 def _orient(P, F, group, mate, counts):

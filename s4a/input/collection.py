@@ -195,7 +195,7 @@ def read_shapes(
 def read_labels(paths: Paths, *, label: Label = "all", **options: Any) -> xr.DataTree:
     """Read label volumes as a collection of surfaces, one structure of each volume.
 
-    Surfaces are extracted by marching cubes, smoothed without shrinking [1]_ and cleaned.  World
+    Surfaces are extracted by marching cubes, smoothed without shrinking and cleaned.  World
     coordinates are in millimetres, RAS.
 
     Parameters
@@ -226,7 +226,7 @@ def read_labels(paths: Paths, *, label: Label = "all", **options: Any) -> xr.Dat
 
     References
     ----------
-    .. [1] G. Taubin, "A signal processing approach to fair surface design", SIGGRAPH 1995.
+    G. Taubin (1995), A signal processing approach to fair surface design, SIGGRAPH.
 
     Examples
     --------

@@ -113,7 +113,7 @@ def _parse_vtk(data):
 
 
 class _Legacy:
-    """The bytes of a legacy file and the position of the reader."""
+    """Bytes of a legacy file and the position of the reader."""
 
     def __init__(self, data):
         head = re.match(rb"[^\n]*\n[^\n]*\n\s*(ASCII|BINARY)\s*\n", data, re.I)

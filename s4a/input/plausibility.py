@@ -222,7 +222,7 @@ def compare(name: str, descriptor: xr.Dataset, references: dict[str, xr.Dataset]
     name : str
         Name of the shape; if it is a reference itself, its values there are NaN.
     descriptor : Dataset
-        Of :func:`describe`.
+        See :func:`describe`.
     references : dict of str to Dataset
         Descriptors of the shapes that :func:`pick_references` names.
 

@@ -232,7 +232,7 @@ def subjects(
 
 def with_table(study: xr.DataTree, path: Path | str) -> xr.DataTree:
     """Return a study with ``/subjects`` read from a file; the study given is not changed."""
-    shapes = study["report" if "report" in study else "registration"].to_dataset()["shape"]
-    names = shapes.values.tolist()
+    report = study["report" if "report" in study else "registration"].to_dataset()
+    names = report["shape"].values.tolist()
     nodes = {n.path: n.to_dataset(inherit=False) for n in study.subtree if n.path != "/subjects"}
     return xr.DataTree.from_dict(nodes | {"/subjects": read_table(path, names)}, name=study.name)

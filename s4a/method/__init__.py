@@ -1,4 +1,4 @@
-"""The method: one file a step of sections 3, 4 and 6.1 of the paper."""
+"""The method: one module per step of sections 3, 4 and 6.1 of the paper."""
 
 from pkgutil import iter_modules
 

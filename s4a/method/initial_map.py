@@ -181,7 +181,7 @@ def best_initial_map(
     for candidate in itertools.chain(maps, maps_from_signatures(source, target, len(C), search)):
         match = fmap.zoomout(source, target, candidate[1], k, step=10)[1]
         match, warp = spectral_icp.coarse_spectral_icp(
-            source, target, match, k_first=20, step=20, iterations=1, articulated=True
+            source, target, match, k_initial=20, step=20, iterations=1, articulated=True
         )
         image = spectral_icp.move(target, warp)
         score = spectral_icp.registration_score(source, target, match, target.moved_to(image))

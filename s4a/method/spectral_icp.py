@@ -96,14 +96,14 @@ def coarse_spectral_icp(
     target: Basis,
     match: Array,
     *,
-    k_first: int = 30,
+    k_initial: int = 30,
     k: int = 100,
     step: int = 5,
     iterations: int = 2,
     spectral: float = 0.0,
     articulated: bool = False,
 ) -> tuple[Array, Warp]:
-    """Spectral ICP on low-resolution meshes, for K = k_first, k_first + step, ..., k.
+    """Spectral ICP on low-resolution meshes, for K = k_initial, k_initial + step, ..., k.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def coarse_spectral_icp(
     warp : tuple (R, t, c)
     """
     k = min(k, target.k, source.k)
-    for K in [*range(min(k_first, k), k, step), k]:
+    for K in [*range(min(k_initial, k), k, step), k]:
         Phi = target.Phi[:, :K]
         spectrum = (target.mass, Phi, target.eigenvalue[:K]) if articulated else None
 
@@ -299,7 +299,7 @@ def candidates(
     initial = source, target, matches[best]
     if articulated and all(poses_differ(source, target, match) for match in matches.values()):
         piecewise = coarse_spectral_icp(
-            *initial, k_first=20, k=k, iterations=1, spectral=0.2, articulated=True
+            *initial, k_initial=20, k=k, iterations=1, spectral=0.2, articulated=True
         )
         add(f"{best}+parts", *piecewise)
     elif min(candidate.score for candidate in results.values()) > max_score:

@@ -1,4 +1,4 @@
-"""The method run over a collection: what is stored, what is done already, what is reported."""
+"""Analysis of a collection: pipeline, storage, quality control, report (4, 6.1)."""
 
 from pkgutil import iter_modules
 

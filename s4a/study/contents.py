@@ -53,7 +53,7 @@ def check_contents(name: str, data: xr.Dataset) -> None:
     name : str
         Path in the folder of the study without the suffix, as ``coarse/brain_01``.
     data : Dataset
-        Of :func:`s4a.study.netcdf.open_file`.
+        See :func:`s4a.study.netcdf.open_file`.
 
     Examples
     --------

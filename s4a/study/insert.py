@@ -73,7 +73,7 @@ def insert(
     Parameters
     ----------
     study : DataTree
-        Of :func:`s4a.analyse` or :func:`s4a.open_study`.
+        See :func:`s4a.analyse` and :func:`s4a.open_study`.
     shapes : path, list of paths, dict or Dataset
         See :func:`s4a.read_shapes`; a single mesh Dataset is named ``new``.
     landmarks : path, optional

@@ -117,9 +117,7 @@ def opened(path: Path | str) -> Iterator[tuple[h5f.FileID, bytes, dict[str, Any]
     """
     with open_hdf5(path) as file:
         if not file.links.exists(GROUP.encode()):
-            raise OSError(
-                f"it has no /{CONTENTS}: another version of s4a wrote it; run the analysis again"
-            )
+            raise OSError(f"it has no /{CONTENTS}: another version of s4a wrote it")
         text = values_of(file, CONTENTS).tobytes()
         yield file, text, json.loads(text)
 

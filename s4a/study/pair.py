@@ -1,4 +1,4 @@
-"""One pair of shapes registered on its own (4.1): the steps from two meshes to a correspondence."""
+"""Pairwise registration (4.1): from two meshes to a correspondence."""
 
 import logging
 from typing import Any
@@ -24,53 +24,62 @@ def match_pair(
 ) -> xr.Dataset:
     """Correspondence of two shapes at full resolution (4.1).
 
-    In far poses a search for an initial map takes several seconds; where more than two shapes are
-    at hand, a network finds the way more surely: :func:`s4a.analyse`, then
-    :func:`s4a.register_shape`.  Landmarks (:func:`s4a.with_landmarks`) guide every step.
+    If poses differ much, the search for an initial map takes several seconds more.  With more than
+    two shapes, a network (:func:`s4a.analyse`) is more reliable.  Landmarks
+    (:func:`s4a.with_landmarks`) guide every step.
 
     Parameters
     ----------
     source, target : path or xarray.Dataset
         Mesh files, or clean meshes, such as :func:`s4a.read_shape` returns.
     preset : {None, "paper", "fast"}
-        ``"paper"`` leaves out all that is added to 4.1, ``"fast"`` takes n_coarse=3000.
+        ``"paper"`` uses the method of 4.1 without additions, ``"fast"`` sets n_coarse=3000.
     **options
         ``n_coarse, k_init, k, step, init, initial_refinement, full_resolution_iterations, refine,
         articulated, refined_eigenfunctions, alignment, area_weighted, n_projected, method, seed``
-        or ``rng``: see :class:`s4a.Options`. Where poses are far apart
-        :func:`s4a.method.initial_map.best_initial_map` is taken, which costs about 2 s more.
+        or ``rng``: see :class:`s4a.Options`.
 
     Returns
     -------
     xarray.Dataset
-        ``fmap(eigenpair_target, eigenpair_source)`` after ZoomOut, ``fmap_initial``,
-        ``match(vertex)`` = on each vertex of the target the matched vertex of the source,
+        ``match(vertex)``, the matched vertex of the source for each vertex of the target;
         ``displacement(vertex, xyz)`` from the target to the source after rigid alignment (unit of
-        the input), and what else :func:`s4a.method.register.register` gives; ``fmap_fitted``, the
-        initial map before its step of ZoomOut, and with landmarks ``landmark_of_source(landmark)``,
-        ``landmark_of_target``; the way back, ``template_triangle(original_vertex)`` and
-        ``template_barycentric``, from the source's vertices to the target; attrs ``score``
-        (:func:`s4a.method.spectral_icp.registration_score`), ``method``, ``initial_map``
-        ("landmarks", "dense", or of far poses "icp", "hks" or "wks"), and ``note`` where k had to
-        be reduced.
+        the input); ``template_triangle(original_vertex)`` and ``template_barycentric``, the inverse
+        match from vertices of the source to points of the target;
+        ``fmap(eigenpair_target, eigenpair_source)`` after ZoomOut, ``fmap_initial``, and
+        ``fmap_fitted``, the initial map before its ZoomOut step; with landmarks
+        ``landmark_of_source(landmark)``, ``landmark_of_target``; and the other variables of
+        :func:`s4a.method.register.register`.  Attributes: ``score``
+        (:func:`s4a.method.spectral_icp.registration_score`), ``initialisation``, ``initial_map``
+        ("landmarks", "dense", "icp", "hks" or "wks"), and ``note`` if k was reduced.
 
     Raises
     ------
     ValueError
-        When a mesh lacks its variables or an option is outside its range, see :func:`s4a.analyse`.
+        If a mesh lacks variables or an option is out of range, see :func:`s4a.analyse`.
+
+    See Also
+    --------
+    analyse : analyse a collection.
+    compare : compare matching algorithms on a pair.
+
+    References
+    ----------
+    S. Melzi, J. Ren, E. Rodolà, A. Sharma, P. Wonka and M. Ovsjanikov (2019), ZoomOut: spectral
+    upsampling for efficient shape correspondence, ACM Transactions on Graphics 38(6).
 
     Examples
     --------
-    A shape and the same after a turn by 90 degrees:
+    A shape and its rotation by 90 degrees:
 
     >>> import s4a
     >>> mesh = s4a.synthetic.ellipsoid(200)
-    >>> turned = mesh.assign(position=mesh["position"][:, [1, 0, 2]] * [-1, 1, 1])
-    >>> found = s4a.match_pair(mesh, turned, n_coarse=100, k=10, k_init=6)
-    >>> found["fmap"].shape, bool((abs(found["displacement"]) < 1e-6).all())
+    >>> rotated = mesh.assign(position=mesh["position"][:, [1, 0, 2]] * [-1, 1, 1])
+    >>> pair = s4a.match_pair(mesh, rotated, n_coarse=100, k=10, k_init=6)
+    >>> pair["fmap"].shape, bool((abs(pair["displacement"]) < 1e-6).all())
     ((10, 10), True)
 
-    The places of one brain in the colours of the places of another that they match:
+    Colours of one brain transferred to another:
 
     >>> brains = s4a.synthetic.brains(2, 3000)["original"]
     >>> source, target = (mesh.to_dataset() for mesh in brains.children.values())
@@ -83,7 +92,7 @@ def match_pair(
     """
     settings = given_options({"preset": preset, **options}, pair=True)
     meshes = as_mesh(source, "source"), as_mesh(target, "target")
-    with threadpool_limits(1):  # products of a pair are small: more threads of BLAS take longer
+    with threadpool_limits(1):  # matrices are small: more BLAS threads take longer
         M, N = (shape_of(mesh, settings) for mesh in meshes)
         registration, maps = match_shapes(M, N, settings)
     least = min(M.low.k, N.low.k)
@@ -96,7 +105,7 @@ def match_pair(
 
 
 def shape_of(mesh: xr.Dataset, options: Options) -> Shape:
-    """The shape of a mesh, with its low resolution and functions."""
+    """Make the shape of a mesh, with low resolution and eigenfunctions."""
     return Shape(
         mesh, low_resolution(mesh, **options.of("low resolution")), **options.of("projection")
     )
@@ -108,9 +117,9 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     Returns
     -------
     registration : Dataset
-        As of :func:`s4a.method.register.register`.
+        See :func:`s4a.method.register.register`.
     maps : Dataset
-        ``fmap``, ``fmap_initial``, ``fmap_fitted`` and the landmarks, where there are any.
+        ``fmap``, ``fmap_initial``, ``fmap_fitted`` and landmarks, if any.
     """
     M = source.low
     N = target.low
@@ -118,7 +127,7 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     k_init = min(options.k_init, k)
     transform = transform_onto(M, N)
     initial_refinement = options.initial_refinement == "always"
-    first = initial_map(
+    initial = initial_map(
         M,
         N,
         transform,
@@ -127,18 +136,18 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
         initial_refinement=initial_refinement,
         search=True,
     )
-    C, match = fmap.zoomout(M, N, first.C, k, step=options.step)
+    C, match = fmap.zoomout(M, N, initial.C, k, step=options.step)
     for _ in range(options.full_resolution_iterations):
         C = refine_at_full_resolution(
             source, target, C, source.full.Phi if source.has_refined_eigenfunctions else None
         )
-    starts = {"intrinsic": match, "icp": first.near}
+    initial_matches = {"intrinsic": match, "icp": initial.near}
     functions = source.functions(C.T), target.functions(np.eye(k))  # eq. 4 compares rows of both
     registration = register(
-        source, target, starts, functions, transform, k=k, **options.of("registration")
+        source, target, initial_matches, functions, transform, k=k, **options.of("registration")
     )
-    maps = dataset(fmap=C, fmap_initial=first.C, fmap_fitted=first.fitted)
-    if first.landmarks is not None:
-        at_source, at_target = first.landmarks
+    maps = dataset(fmap=C, fmap_initial=initial.C, fmap_fitted=initial.fitted)
+    if initial.landmarks is not None:
+        at_source, at_target = initial.landmarks
         maps = maps.merge(dataset(landmark_of_source=at_source, landmark_of_target=at_target))
-    return registration.assign_attrs(initial_map=first.name), maps
+    return registration.assign_attrs(initial_map=initial.name), maps

@@ -1,8 +1,8 @@
-"""The whole analysis (4, 6.1): the steps of the paper, one after the other, over a collection.
+"""Analysis of a collection (4, 6.1): all steps of the paper.
 
-Every step takes the keys of the files that it is made from and gives those of its own.  A key is
-a hash of all that a file depends on; the files are in the folder of the run, and what computes one
-of them is in :mod:`s4a.study.tasks`.
+Every step takes the keys of its input files and returns those of its output.  A key is a hash of
+everything that a file depends on.  Files are in the folder of the run, and computed by the
+functions of :mod:`s4a.study.tasks`.
 """
 
 import logging
@@ -42,18 +42,18 @@ from s4a.study.sources import (
     check_one_structure,
     find_guides,
     find_sources,
-    kept_table,
-    of_contents,
     remarks_on_guides,
+    remarks_on_table,
+    with_contents,
 )
 from s4a.study.store import lock, task_key, write
 from s4a.study.tasks import (
     align_shape,
     clean_shape,
     consistent_maps,
+    insert_shape,
     last_template,
     map_pairs,
-    place_shape,
     register_shape,
     remesh_shape,
 )
@@ -82,25 +82,26 @@ def analyse(
     n_jobs: int | None = None,
     **others: Any,
 ) -> xr.DataTree:
-    """From a collection of meshes to a median shape, dense correspondences and modes.
+    """Analyse a collection of meshes: median shape, dense correspondences, modes of variation.
+
+    The steps are those of the paper, with elastic iterations added by default.
 
     Parameters
     ----------
     shapes : path, list of paths, dict or xarray.DataTree
-        A folder, a glob, files, or by name a file or a mesh in memory, a Dataset or (points,
-        triangles), or what :func:`s4a.read_shapes` gives.
-    preset, n_coarse, n_pairs, k, label, reflect, table, landmarks, template, scale
-        The options that people change; one that is not given, or as None, is that of `options`, or
-        its default.  See :class:`s4a.Options`.
+        A folder, a glob, files, a dict of name to a file, a Dataset or (points, triangles), or what
+        :func:`s4a.read_shapes` returns.
+    preset, n_coarse, n_pairs, k, label, reflect, table, landmarks, template, remove_size
+        The most used options, see :class:`s4a.Options`.  None means the value of `options`, or the
+        default.
     options : Options, optional
-        In place of the defaults.
+        Options that replace the defaults.
     **others
-        Every other option, by the name that it has in :class:`s4a.Options`; ``rng`` for ``seed``.
+        Every other option of :class:`s4a.Options`; ``rng`` for ``seed``.
     store : path, optional
-        Folder of the study.  A run that was killed goes on at the first missing file.
+        Folder of the study.  A run that was interrupted resumes at the first missing file.
     n_jobs : int, optional
-        Processes, as in joblib: -1 for all cores given to this process.  The result does not depend
-        on it.
+        Processes, as in joblib: -1 for all available cores.  The result does not depend on it.
 
     Returns
     -------
@@ -111,10 +112,23 @@ def analyse(
     Raises
     ------
     ValueError
-        When an option is out of range, or fewer than 2 shapes can be used; the reasons are named.
-        With ``quality_control="stop"``, when a shape is flagged.
+        If an option is out of range, or fewer than 2 shapes can be used; the message has the
+        reasons.  With ``quality_control="stop"``, if a shape is flagged.
     TypeError
-        When an option is given that there is not.
+        If an option does not exist.
+
+    See Also
+    --------
+    read_shapes : read and check a collection only.
+    open_study : open the folder of a study.
+    insert : insert new shapes into a study.
+    match_pair : register a pair of shapes.
+
+    References
+    ----------
+    Maccarone et al., S4A: Scalable Spectral Statistical Shape Analysis.
+    R. Huang, J. Ren, P. Wonka and M. Ovsjanikov (2020), Consistent ZoomOut: efficient spectral map
+    synchronization, Computer Graphics Forum 39(5).
 
     Examples
     --------
@@ -123,7 +137,7 @@ def analyse(
     >>> list(study["pca"]["score"].dims), study["registration"].sizes["vertex"]
     (['shape', 'component'], 200)
 
-    The paper, and elastic iterations alone added to it:
+    The method of the paper, with and without elastic iterations:
 
     >>> from s4a.options import PRESETS
     >>> small = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 3}
@@ -131,7 +145,7 @@ def analyse(
     >>> paper = s4a.analyse(brains, preset="paper", **small)
     >>> elastic = s4a.analyse(brains, **PRESETS["paper"] | {"refine": "elastic"}, **small)
     """
-    shown = {
+    named = {
         "preset": preset,
         "n_coarse": n_coarse,
         "n_pairs": n_pairs,
@@ -143,7 +157,7 @@ def analyse(
         "template": template,
         "remove_size": remove_size,
     }
-    given = {name: value for name, value in shown.items() if value is not None}
+    given = {name: value for name, value in named.items() if value is not None}
     settings = given_options(given | others, options)
     if store is None:
         with temporary_folder() as folder:
@@ -164,9 +178,9 @@ def analyse(
     with lock(store) as claim:
         run = Run(claim, n_jobs)
         if subjects is not None:
-            write(of_contents(subjects, sources), run.folder / "subjects.nc")
+            write(with_contents(subjects, sources), run.folder / "subjects.nc")
         else:
-            remarks = remarks + kept_table(run.folder / "subjects.nc", sources)
+            remarks = remarks + remarks_on_table(run.folder / "subjects.nc", sources)
         remarks = remarks + remarks_on_guides(sources, marked, settings.feature_names)
         with run.report_unforeseen():
             run_steps(run, sources, marked, settings, remarks)
@@ -176,36 +190,36 @@ def analyse(
 def run_steps(
     run: Run, sources: Sources, marked: Marked, options: Options, remarks: list[str]
 ) -> None:
-    """All steps of the paper in turn; each looks up which of its files are done."""
-    # what each file is made from; a key holds the keys of all before it:
+    """Run all steps of the paper; each skips files that are done."""
+    # dependencies of the files; a key contains those of all files before it:
     #
     #   original/* -> coarse/* -> network/alignment_* -> network/initial_* -> network, latent
     #       |                                                                  |
-    #   network/descriptor_*, look_*  latent/* of those apart -> registration/* <- registration
+    #   network/descriptor_*, comparison_*    latent/* of excluded -> registration/* <- registration
     #                                                     |
     #                                                pca, report
-    reflected, chirality_evidence = choose_reflected(run, sources, marked, options)
+    reflected, on_chirality = choose_reflected(run, sources, marked, options)
     original = read_and_clean(run, sources, marked, options, reflected)
-    original, flags, told = check_plausibility(run, original, options)
+    original, flags, on_shapes = check_plausibility(run, original, options)
     stop_if_flagged(flags, options)
     coarse = remesh(run, original, options)
-    flags, coarse, apart, alone = exclude_flagged(run, coarse, flags, options)
+    flags, coarse, excluded, on_exclusion = exclude_flagged(run, coarse, flags, options)
     coarse, reference, aligned = align(run, coarse, options)
-    first = initial_maps(run, coarse, aligned, options)
-    latent = consistent_zoomout(run, coarse, first, options)
-    placed = place(run, apart, reference, latent, options)
-    registered = register(run, coarse | apart, placed, latent, options)
-    failed, of_all = check_registrations(run, registered, placed)
+    initial = initial_maps(run, coarse, aligned, options)
+    latent = consistent_zoomout(run, coarse, initial, options)
+    inserted = insert_excluded(run, excluded, reference, latent, options)
+    registered = register(run, coarse | excluded, inserted, latent, options)
+    failed, on_registrations = check_registrations(run, registered, inserted)
     flags = {name: [*flags.get(name, []), *failed.get(name, [])] for name in registered}
     why_no_modes = modes(run, registered, flags, options)
-    remarks = [*chirality_evidence, *alone, *told, *of_all, *remarks]
+    remarks = [*on_chirality, *on_exclusion, *on_shapes, *on_registrations, *remarks]
     write_report(run, sources, options, remarks, why_no_modes, registered, flags)
 
 
 def read_and_clean(
     run: Run, sources: Sources, marked: Marked, options: Options, reflected: list[str]
 ) -> Keys:
-    """The shapes, cleaned, with landmarks, some of them mirrored (5.1): ``/original``."""
+    """Read and clean the shapes, add landmarks and fields, mirror some (5.1): ``/original``."""
     cleaning = options.of("cleaning")
     todo = []
     for n, (source, content) in sources.items():
@@ -213,21 +227,21 @@ def read_and_clean(
         key = (content, cleaning, *also.values())
         if n in marked:
             also["guides"] = landmarks, features = marked[n]
-            # wherever the files lie
+            # the contents, not the paths
             key = (*key, *([landmarks[1]] if landmarks else []))
             key = (*key, *((name, content) for name, (_, content) in features.items()))
-        given = (source, content, cleaning, also)
-        todo.append(Task(n, f"original/{n}.nc", clean_shape, given, key))
+        arguments = (source, content, cleaning, also)
+        todo.append(Task(n, f"original/{n}.nc", clean_shape, arguments, key))
     return run.do("read and clean", todo)
 
 
 def choose_reflected(
     run: Run, sources: Sources, marked: Marked, options: Options
 ) -> tuple[list[str], list[str]]:
-    """The shapes whose mirror images are taken, and what is told of the choice.
+    """Choose the shapes to mirror; return their names, and remarks.
 
-    Where the shapes themselves shall say (``reflect="auto"``), they are looked at as they are
-    first; ``network/chirality`` keeps the choice.
+    With ``reflect="auto"`` the shapes are first compared as they are; the choice is stored in
+    ``network/chirality``.
     """
     if options.reflect is None:
         return [], []
@@ -236,29 +250,29 @@ def choose_reflected(
         subjects = read(table) if table.is_file() else None
         reflected = to_reflect(str(options.reflect), list(sources), subjects)
         is_all = len(reflected) == len(sources)
-        return reflected, ["reflect= mirrors all: nothing changes among them"] if is_all else []
+        return reflected, ["reflect= mirrors all shapes, with no effect"] if is_all else []
     file = run.folder / CHOICE
     contents = [content for _, content in sources.values()]
     key = task_key(list(sources), contents, options.of("cleaning"), options.k, AUTO)
     if not is_done(file, key):
         original = read_and_clean(run, sources, marked, options, [])
-        looks = comparisons_of(run, original, options) if len(original) > 1 else {}
-        reflected, told = mirrored_shapes(looks)
+        comparisons = comparisons_of(run, original, options) if len(original) > 1 else {}
+        reflected, remarks = mirrored_shapes(comparisons)
         choice = dataset(
-            {"told": "\n".join(told)},
-            mean_chirality=mean_chirality(looks) if looks else np.zeros(0),
-            reflected=np.array([name in reflected for name in looks], int),
+            {"remarks": "\n".join(remarks)},
+            mean_chirality=mean_chirality(comparisons) if comparisons else np.zeros(0),
+            reflected=np.array([name in reflected for name in comparisons], int),
         )
-        write(choice.assign_coords(shape=list(looks)), file, key)
+        write(choice.assign_coords(shape=list(comparisons)), file, key)
     choice = read(file)
-    told = choice.attrs["told"].splitlines()
-    for line in told:
-        log.warning("%s", line)
-    return choice["shape"].values[choice["reflected"].values.astype(bool)].tolist(), told
+    remarks = choice.attrs["remarks"].splitlines()
+    for remark in remarks:
+        log.warning("%s", remark)
+    return choice["shape"].values[choice["reflected"].values.astype(bool)].tolist(), remarks
 
 
 def remesh(run: Run, original: Keys, options: Options) -> Keys:
-    """Low-resolution meshes and their spectra (4.1, step 1): ``/coarse``."""
+    """Remesh the shapes and compute their spectra (4.1, step 1): ``/coarse``."""
     settings: tuple[Any, ...] = (options.n_coarse, options.wrap, options.seed, options.k)
     if options.refined_eigenfunctions:
         settings = (*settings, "refined eigenfunctions")
@@ -274,23 +288,23 @@ def remesh(run: Run, original: Keys, options: Options) -> Keys:
 
 
 def lowest_eigenvalues(run: Run, coarse: Keys, k_init: int) -> np.ndarray:
-    """The `k_init` lowest eigenvalues of every shape (n, k_init); fewer where a shape has fewer."""
+    """Read the lowest eigenvalues of every shape ``(n, k_init)``; fewer if a shape has fewer."""
     spectra = [arrays(run.folder / f"coarse/{name}.nc", "eigenvalue")[0] for name in coarse]
     k_init = min(k_init, *map(len, spectra))
     return np.stack([spectrum[:k_init] for spectrum in spectra])
 
 
 def align(run: Run, coarse: Keys, options: Options) -> tuple[Keys, tuple[str, str], str]:
-    """All shapes moved onto the one whose spectrum is nearest to all others (4.1, step 2).
+    """Align all shapes to the one with the smallest spectral distances (4.1, step 2).
 
     Returns
     -------
     coarse : dict of str to str
-        Keys of the shapes that could be moved.
+        Keys of the shapes that could be aligned.
     reference : tuple (name, key)
-        The shape that they were moved onto.
+        The shape that they were aligned to.
     aligned : str
-        The key that all transforms depend on.
+        The key of all transforms.
     """
     names = list(coarse)
     spectra = lowest_eigenvalues(run, coarse, options.k_init)
@@ -306,7 +320,7 @@ def align(run: Run, coarse: Keys, options: Options) -> tuple[Keys, tuple[str, st
 
 
 def initial_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys:
-    """The pairs of the network, of like spectra, and their initial maps (4.1, steps 3 and 4)."""
+    """Choose pairs of similar spectra, and compute initial maps (4.1, steps 3 and 4)."""
     spectra = lowest_eigenvalues(run, coarse, options.k_init)
     names, k_init = list(coarse), spectra.shape[1]
     pairs = choose_pairs(spectral_distance(spectra), options.n_pairs)
@@ -321,7 +335,7 @@ def initial_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys
 
 
 def in_batches(pairs: Sequence[Any]) -> list[Any]:
-    """The pairs in batches for the tasks of the initial maps: four in each, or 64 batches.
+    """Split pairs into batches, one per task: four pairs each, or 64 batches.
 
     Examples
     --------
@@ -333,13 +347,13 @@ def in_batches(pairs: Sequence[Any]) -> list[Any]:
     return [pairs[i : i + size] for i in range(0, len(pairs), size)]
 
 
-def consistent_zoomout(run: Run, coarse: Keys, first: Keys, options: Options) -> str:
-    """Consistent ZoomOut and the median shape (4.2, eq. 5): ``/network`` and ``/latent``.
+def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) -> str:
+    """Consistent ZoomOut and median shape (4.2, eq. 5): ``/network`` and ``/latent``.
 
     Returns
     -------
     str
-        The key of both.
+        The key of both files.
     """
     settings = (options.k, options.step, options.n_latent, options.norm)
     iteration_settings = (
@@ -348,18 +362,18 @@ def consistent_zoomout(run: Run, coarse: Keys, first: Keys, options: Options) ->
         options.dense_iterations,
         options.keep_iterations,
     )
-    key = task_key(list(first.values()), *settings, *iteration_settings)
-    kept = list((run.folder / "iterations").glob("k_*.nc")) if options.keep_iterations else []
-    files = [run.folder / "network.nc", run.folder / "latent.nc", *kept]
-    done = bool(kept) == options.keep_iterations and all(is_done(file, key) for file in files)
+    key = task_key(list(initial.values()), *settings, *iteration_settings)
+    old_files = list((run.folder / "iterations").glob("k_*.nc")) if options.keep_iterations else []
+    files = [run.folder / "network.nc", run.folder / "latent.nc", *old_files]
+    done = bool(old_files) == options.keep_iterations and all(is_done(file, key) for file in files)
     with run.stage("consistent ZoomOut and median", share=float(not done), done=int(done)):
         if done:
             return key
-        maps = xr.concat([read(run.folder / file) for file in first], dim="pair")
+        maps = xr.concat([read(run.folder / file) for file in initial], dim="pair")
         with parallel_config(backend="threading"):  # here, whatever backend the tasks run on
             n_threads = effective_n_jobs(run.n_jobs)
         tree = consistent_maps(run, list(coarse), maps, options, n_threads)
-        for old in (run.folder / "iterations").glob("k_*.nc"):  # of other maps
+        for old in (run.folder / "iterations").glob("k_*.nc"):  # of an earlier run
             old.unlink()
         iterations = (
             [f"iterations/{name}" for name in tree["iterations"].children]
@@ -371,16 +385,18 @@ def consistent_zoomout(run: Run, coarse: Keys, first: Keys, options: Options) ->
     return key
 
 
-def place(run: Run, apart: Keys, reference: tuple[str, str], latent: str, options: Options) -> Keys:
-    """The shapes that stand apart, beside the network as it is (eq. 3): ``/latent/<shape>``.
+def insert_excluded(
+    run: Run, excluded: Keys, reference: tuple[str, str], latent: str, options: Options
+) -> Keys:
+    """Insert the shapes that are excluded from the network (eq. 3): ``/latent/<shape>``.
 
-    Each is aligned to the reference of the network, and its latent basis solves for its maps to
-    some shapes of the network, whose bases stay.
+    Each shape is aligned to the reference and mapped to some shapes of the network; its latent
+    basis is solved for with their bases fixed.
 
     Parameters
     ----------
-    apart : dict of str to str
-        Keys of their low-resolution meshes.
+    excluded : dict of str to str
+        Keys of the low-resolution meshes.
     reference : tuple (name, key)
     """
     name, reference_key = reference
@@ -388,74 +404,74 @@ def place(run: Run, apart: Keys, reference: tuple[str, str], latent: str, option
         Task(
             n, f"network/alignment_{n}.nc", align_shape, (run.folder, n, name), (reference_key, key)
         )
-        for n, key in apart.items()
+        for n, key in excluded.items()
     ]
-    aligned = run.do("align flagged shapes", todo) if apart else {}
+    aligned = run.do("align flagged shapes", todo) if excluded else {}
     settings = (options.k_init, options.of("initial maps"), options.step, options.norm)
     todo = [
         Task(
             n,
             f"latent/{n}.nc",
-            place_shape,
+            insert_shape,
             (run.folder, n, options),
-            (latent, apart[n], key, settings),
-            (latent, apart[n]),
+            (latent, excluded[n], key, settings),
+            (latent, excluded[n]),
         )
         for n, key in aligned.items()
     ]
-    return run.do("place flagged shapes", todo) if aligned else {}
+    return run.do("insert flagged shapes", todo) if aligned else {}
 
 
-def register(run: Run, coarse: Keys, placed: Keys, latent: str, options: Options) -> Keys:
-    """Every shape registered to the template, the median shape by default (4.2, eq. 6 to 8)."""
+def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Options) -> Keys:
+    """Register every shape to the template, the median shape by default (4.2, eq. 6 to 8)."""
     template = options.template or attributes(run.folder / "latent.nc")["median"]
     projection = (options.area_weighted, options.n_projected)
-    way = (template, options.dense_match, options.of("registration"), projection)
-    template_key = task_key(latent, way)
+    settings = (template, options.dense_match, options.of("registration"), projection)
+    template_key = task_key(latent, settings)
     mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
-    if placed:
-        mesh.attrs["excluded"] = " ".join(placed)
+    if inserted:
+        mesh.attrs["excluded"] = " ".join(inserted)
     write(mesh, run.folder / "registration.nc", template_key, [latent])
     todo = []
     for n, key in sorted(coarse.items()):
         if n in run.failures:
             continue
-        own = (placed[n],) if n in placed else ()
+        latent_key = (inserted[n],) if n in inserted else ()
         todo.append(
             Task(
                 n,
                 f"registration/{n}.nc",
                 register_shape,
                 (run.folder, n, template, options),
-                (template_key, key, *own),
-                (template_key, *own),
+                (template_key, key, *latent_key),
+                (template_key, *latent_key),
             )
         )
     registered = run.do("registration", todo)
-    last_template.clear()  # of this process, where it registered itself
+    last_template.clear()  # of this process, if it registered shapes itself
     return registered
 
 
 def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> str:
-    """The modes of the displacements (6.1): ``/pca``; the reason where there can be none.
+    """Compute the modes of variation (6.1), ``/pca``; return the reason if there are none.
 
-    They are made without the flagged shapes, whose scores are measured along them.
+    Flagged shapes are excluded; their scores are computed along the modes of the others.
     """
     with run.stage("modes"):
         mesh = read(run.folder / "registration.nc")
         template = mesh.attrs["template"]
         files = {name: open_file(run.folder / f"registration/{name}.nc") for name in registered}
         data = stack_registration(mesh, files, list(files), lazily=True)["registration"]
-        apart = [
+        excluded = [
             name
             for name in registered
             if name != template and any(flag.flagged for flag in flags[name])
         ]
-        apart = [] if options.include_flagged else apart
+        excluded = [] if options.include_flagged else excluded
         coarse = read(run.folder / f"coarse/{template}.nc")
         keys = list(registered.values())
         try:
-            result = pca_without(data, apart, coarse, area_weighted=options.area_weighted)
+            result = pca_without(data, excluded, coarse, area_weighted=options.area_weighted)
         except ValueError as error:
             log.warning("no modes: %s", error)
             (run.folder / "pca.nc").unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Worker processes of a run (4): they end with the process that started them, leaving nothing."""
+"""Worker processes of a run (4), which end with the process that started them."""
 
 import contextlib
 import ctypes
@@ -21,20 +21,20 @@ from joblib.parallel import LokyBackend, get_active_backend
 
 from s4a.geometry.compiled import psutil
 
-CAN_HOLD = find_spec("fcntl") is not None  # not on Windows, where nobody can tell who holds what
+CAN_LOCK = find_spec("fcntl") is not None  # not on Windows
 PR_SET_PDEATHSIG, M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = 1, -1, -3  # of Linux and glibc
-TEMPORARY = "s4a-"  # how the folder of a study that nobody keeps begins
+TEMPORARY = "s4a-"  # prefix of the folder of a temporary study
 
 
 def workers(n_jobs: int | None, **options: Any) -> Parallel:
-    """:class:`joblib.Parallel` whose processes end within a second of this one, however it ends.
+    """Make a :class:`joblib.Parallel` whose processes end within a second of this one.
 
     Parameters
     ----------
     n_jobs : int, optional
         As in joblib.
     **options
-        Of :class:`joblib.Parallel`.
+        Options of :class:`joblib.Parallel`.
 
     Examples
     --------
@@ -51,22 +51,22 @@ def workers(n_jobs: int | None, **options: Any) -> Parallel:
 
 
 def begin_worker(owner: int, at_once: bool) -> None:
-    """Let this process end within a second of process `owner`, and ignore Ctrl-C, its affair.
+    """Let this process end within a second of process `owner`, and ignore Ctrl-C.
 
     Parameters
     ----------
     owner : int
-        Which started this process.
+        The process that started this one.
     at_once : bool
-        Whether the system may end it, in the midst of native code too: that looks at the thread
-        that started this process, which then must be one that lives as long as the owner.
+        Let the system end this process, even in native code.  It does so when the thread that
+        started this process ends, so that thread must live as long as the owner.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if sys.platform == "linux":
         c = ctypes.CDLL(None)
         if at_once:
             c.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if hasattr(c, "mallopt"):  # of glibc: memory that arrays freed is used again, not cleared
+        if hasattr(c, "mallopt"):  # of glibc: reuse freed memory instead of returning it
             c.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
             c.mallopt(M_MMAP_THRESHOLD, 2**30)
 
@@ -80,19 +80,19 @@ def begin_worker(owner: int, at_once: bool) -> None:
 
 @contextlib.contextmanager
 def interruption_kept() -> Iterator[threading.Event]:
-    """Ctrl-C is remembered, as its KeyboardInterrupt may be lost.
+    """Remember Ctrl-C, as its KeyboardInterrupt may be lost.
 
-    Python drops one that comes in a destructor or in the callback of a weak reference, of which
-    HDF5 has many, and says "Exception ignored"; a library may take it for an error of its own.
+    Python drops the exception in a destructor or a callback of a weak reference, of which HDF5 has
+    many ("Exception ignored"), and a library may catch it.
 
     Yields
     ------
     threading.Event
-        Set from the first Ctrl-C on.
+        Set by the first Ctrl-C.
     """
     asked = threading.Event()
     before = signal.getsignal(signal.SIGINT)
-    # signals come to the main thread, and this one may be ignored
+    # only the main thread receives signals, and SIGINT may be ignored
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield asked
         return
@@ -109,14 +109,14 @@ def interruption_kept() -> Iterator[threading.Event]:
 
 
 def remove_remains(token: str) -> None:
-    """Remove what the workers of a process that is no more left behind: semaphores, memory maps.
+    """Remove semaphores and memory maps of the workers of a process that has ended.
 
-    They stay when all processes of a run are killed at the same time; Linux has both as files.
+    They remain if all processes of a run are killed at once; on Linux both are files.
 
     Parameters
     ----------
     token : str
-        Of :class:`s4a.study.store.Claim`, as it was found in a lock that nobody held.
+        Token of :class:`s4a.study.store.Claim`, read from a lock that no process holds.
     """
     owner = re.match(r"\d{1,9}\b", token)
     if not owner or not psutil or psutil.pid_exists(int(owner[0])):
@@ -131,7 +131,7 @@ def remove_remains(token: str) -> None:
 
 
 def died(error: Exception) -> str:
-    """How a worker died, when the error of joblib or dask says that one did; empty otherwise.
+    """Describe how a worker died, from an error of joblib or dask; empty for other errors.
 
     Examples
     --------
@@ -145,30 +145,30 @@ def died(error: Exception) -> str:
     names = {kind.__name__ for kind in type(error).__mro__}
     if not names & {"BrokenProcessPool", "KilledWorker"}:
         return ""
-    # those of the others are SIGTERM: joblib ends them when it has seen the first
+    # the other workers have SIGTERM, as joblib then ends them
     codes = re.findall(r"(\w+)\((-?\d+)\)", str(error))
     signals = [name for name, code in codes if int(code) < 0] or [f"exit {c}" for _, c in codes]
-    known = {"SIGKILL": "out of memory?", "SIGSEGV": "a fault in native code"}
-    return ", ".join(f"{name}: {known[name]}" if name in known else name for name in signals) or (
+    causes = {"SIGKILL": "out of memory?", "SIGSEGV": "a fault in native code"}
+    return ", ".join(f"{name}: {causes[name]}" if name in causes else name for name in signals) or (
         "out of memory?" if "KilledWorker" in names else str(error).splitlines()[0]
     )
 
 
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """A folder for a study that nobody keeps, removed at the end; those of killed runs as well."""
+    """Make a folder for a temporary study, removed at the end with those of killed runs."""
     remove_abandoned(Path(tempfile.gettempdir()))
-    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as name, held(Path(name)):
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as name, locked(Path(name)):
         yield Path(name)
 
 
 def remove_abandoned(parent: Path) -> None:
-    """Remove the temporary studies that no process holds any more."""
-    if not CAN_HOLD:
+    """Remove temporary studies that no process has locked."""
+    if not CAN_LOCK:
         return
     for folder in parent.glob(f"{TEMPORARY}????????"):
-        with contextlib.suppress(OSError), held(folder):
-            # one that is just being made is held before it has a file
+        with contextlib.suppress(OSError), locked(folder):
+            # a new folder is locked before it has a file
             old = time.time() - folder.stat().st_mtime > 3600
             lock = folder / ".lock"
             if folder.stat().st_uid == os.getuid() and (old or lock.is_file()):
@@ -177,30 +177,30 @@ def remove_abandoned(parent: Path) -> None:
                 remove_remains(token)
 
 
-def hold(handle: int) -> bool:
-    """Hold an open file or folder; False where this system cannot.
+def try_lock(handle: int) -> bool:
+    """Lock an open file or folder; return False if the system cannot.
 
     Raises
     ------
     OSError
-        When another process holds it.
+        If another process has locked it.
     """
-    if CAN_HOLD:
+    if CAN_LOCK:
         import fcntl
 
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    return CAN_HOLD
+    return CAN_LOCK
 
 
 @contextlib.contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Hold a folder until this process ends in whatever way; OSError when another one does."""
-    if not CAN_HOLD:
+def locked(folder: Path) -> Iterator[None]:
+    """Lock a folder until this process ends; OSError if another process has locked it."""
+    if not CAN_LOCK:
         yield
         return
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
-        hold(handle)
+        try_lock(handle)
         yield
     finally:
         os.close(handle)

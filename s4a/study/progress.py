@@ -1,4 +1,4 @@
-"""How far a run over a study folder is (4): what it notes while it works, and who looks at that."""
+"""Progress of a run over a study folder (4): write and read its status file."""
 
 import contextlib
 import json
@@ -15,8 +15,8 @@ from s4a.study.netcdf import check_regular
 log = logging.getLogger(__name__)
 
 FILE = ".progress.json"
-EVERY = 1.0  # seconds between two notes of a stage
-# of every run, in order; those of flagged shapes are in some
+EVERY = 1.0  # seconds between two writes during a stage
+# stages of every run, in order; some runs also have those of flagged shapes
 STAGES = (
     "read and clean",
     "descriptor",
@@ -31,42 +31,42 @@ STAGES = (
 
 
 class Stage(NamedTuple):
-    """How far a stage is.
+    """Progress of a stage.
 
-    Of its tasks, one for each shape or for some pairs, `done` of `all` have a file, and `had` of
-    them did when this run began it, at the time `begun` (seconds since 1970).  `seconds` and
-    `memory` (MiB) are what it took in all runs; memory is NaN where the system does not say.
+    `done` of `all` tasks, one per shape or for some pairs, have a file; `done_before` had one when
+    this run began the stage, at the time `begun` (seconds since 1970).  `seconds` and `memory`
+    (MiB) are totals of all runs; memory is NaN if unknown.
     """
 
     done: int
     all: int
-    had: int
+    done_before: int
     begun: float
     seconds: float
     memory: float
     ended: bool
 
     def remaining(self, now: float) -> float:
-        """Seconds until its end by the pace of this run; NaN where there is none yet."""
-        if self.ended or self.done <= self.had:
+        """Estimate the seconds until the end; NaN before the first task of this run."""
+        if self.ended or self.done <= self.done_before:
             return 0.0 if self.ended else float("nan")
-        return (now - self.begun) / (self.done - self.had) * (self.all - self.done)
+        return (now - self.begun) / (self.done - self.done_before) * (self.all - self.done)
 
 
 class Status(NamedTuple):
-    """How far a run is.
+    """Status of a run.
 
-    `state` is "running", "finished", "stopped", or "elsewhere" where it runs or ran on the other
-    machine `host`; `owner` is its process, `begun` and `told` when it began and when it last said
-    something (seconds since 1970).  `stages` are those that it reached, `failures` the shapes that
-    it left out and why, `memory` (MiB) and `processes` what it has now, both 0 where it is over.
+    `state` is "running", "finished", "stopped", or "elsewhere" for a run on another machine `host`.
+    `owner` is the process, `begun` its start and `updated` the last write (seconds since 1970).
+    `stages` were reached; `failures` are excluded shapes with reasons.  `memory` (MiB) and
+    `processes` are the present use, 0 after the end.
     """
 
     state: str
     host: str
     owner: int
     begun: float
-    told: float
+    updated: float
     stages: dict[str, Stage]
     failures: dict[str, str]
     memory: float
@@ -74,46 +74,46 @@ class Status(NamedTuple):
 
 
 class Notes:
-    """What a run notes of itself in its folder; what cannot be written is not missed by it.
+    """Writer of the status file of a run; a failed write does not stop the run.
 
     Attributes
     ----------
     costs : dict of str to list
-        Seconds and MiB of every stage, those of earlier runs over the folder included.
+        Seconds and MiB of every stage, in all runs over the folder.
     stages : dict of str to Stage
-        Those that this run reached.
+        Stages that this run reached.
     failures : dict of str to str
-        Name of a shape that is left out -> why.
+        Name of an excluded shape -> reason.
     """
 
     def __init__(self, folder: Path, owner: int):
-        self.path, self.told = folder / FILE, time.time()
+        self.path, self.updated = folder / FILE, time.time()
         self.over = ""
-        self.run = {"owner": owner, "host": platform.node(), "begun": self.told}
+        self.run = {"owner": owner, "host": platform.node(), "begun": self.updated}
         self.stages: dict[str, Stage] = {}
         self.failures: dict[str, str] = {}
         self.costs = read_costs(self.path)
 
     def add(self, stage: str) -> None:
-        """One task more is done, or has failed."""
+        """Count a task that is done, or has failed."""
         self.stages[stage] = self.stages[stage]._replace(done=self.stages[stage].done + 1)
-        if time.time() - self.told > EVERY:
+        if time.time() - self.updated > EVERY:
             self.write()
 
     def write(self, over: str = "") -> None:
-        """Write all of it at once, and whether the run is over: "finished" or "stopped"."""
-        self.told, self.over = time.time(), over
-        said = self.run | {"told": self.told, "over": over, "stages": self.stages}
-        said |= {"failures": self.failures, "costs": self.costs}
+        """Write the status; `over` is "finished" or "stopped" at the end of the run."""
+        self.updated, self.over = time.time(), over
+        status = self.run | {"updated": self.updated, "over": over, "stages": self.stages}
+        status |= {"failures": self.failures, "costs": self.costs}
         with contextlib.suppress(OSError):
             new = self.path.with_name(f"{self.path.name}.tmp")
             new.unlink(missing_ok=True)  # it may be a link
-            new.write_text(json.dumps(said))
+            new.write_text(json.dumps(status))
             os.replace(new, self.path)
 
 
 def read_costs(path: Path) -> dict[str, list[float]]:
-    """The costs in the note of an earlier run; a note of any other form is told and has none."""
+    """Read the costs of earlier runs; none, with a warning, if the file is damaged."""
     try:
         check_regular(path)
         costs = json.loads(path.read_text("utf-8"))["costs"]
@@ -122,23 +122,23 @@ def read_costs(path: Path) -> dict[str, list[float]]:
         }
     except FileNotFoundError:
         return {}
-    except Exception as error:  # whatever it holds, the run goes on
+    except Exception as error:  # no content may stop the run
         log.warning("%s cannot be read (%s): times of earlier runs are not counted", path, error)
         return {}
 
 
 def status(folder: Path | str) -> Status:
-    """How far the run over a folder is, or was when it was stopped.
+    """Read the progress of a run, or of a run that was stopped.
 
     Parameters
     ----------
     folder : path
-        Of a study.  Nothing in it is changed, and the run is not disturbed.
+        Folder of a study; it is not changed, and the run is not disturbed.
 
     Raises
     ------
     ValueError
-        When no run has noted anything there, or the note has another form.
+        If there is no status file, or it is damaged.
 
     Examples
     --------
@@ -149,44 +149,44 @@ def status(folder: Path | str) -> Status:
     >>> study = s4a.analyse(
     ...     s4a.synthetic.brains(3, 200), n_coarse=100, k=10, k_init=6, n_pairs=3, store=store
     ... )
-    >>> found = status(store)
-    >>> found.state, found.stages["registration"].done
+    >>> run = status(store)
+    >>> run.state, run.stages["registration"].done
     ('finished', 3)
     """
     path = Path(folder) / FILE
     try:
         check_regular(path)
-        said = json.loads(path.read_text("utf-8"))
+        data = json.loads(path.read_text("utf-8"))
     except FileNotFoundError:
         raise ValueError(
-            f"{folder} has no {FILE}: no run of this version of s4a has begun there; "
-            "`s4a verify` says what a study holds"
+            f"{folder} has no {FILE}: no run of this version of s4a was started there; "
+            "`s4a verify` lists the files of a study"
         ) from None
     except (OSError, ValueError) as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
     try:
-        return _status(said)
+        return _status(data)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ValueError(f"{path} is no note of a run: {error!r}") from error
+        raise ValueError(f"{path} is not a status file of a run: {error!r}") from error
 
 
-def _status(said: dict[str, Any]) -> Status:
-    stages = {name: Stage(*stage) for name, stage in said["stages"].items()}
-    owner, begun, state = int(said["owner"]), float(said["begun"]), said["over"]
+def _status(data: dict[str, Any]) -> Status:
+    stages = {name: Stage(*stage) for name, stage in data["stages"].items()}
+    owner, begun, state = int(data["owner"]), float(data["begun"]), data["over"]
     memory, processes = 0.0, 0
-    if not state and said["host"] != platform.node():
+    if not state and data["host"] != platform.node():
         state = "elsewhere"
     elif not state:
         memory, processes = memory_of(owner, begun)
         state = "running" if processes else "stopped"
-    rest = said["told"], stages, dict(said["failures"]), memory, processes
-    return Status(state, said["host"], owner, begun, *rest)
+    rest = data["updated"], stages, dict(data["failures"]), memory, processes
+    return Status(state, data["host"], owner, begun, *rest)
 
 
 def memory_of(owner: int, begun: float) -> tuple[float, int]:
-    """MiB of a run and the processes below it, and how many there are.
+    """Memory (MiB) and number of the processes of a run.
 
-    None where the process of that number is not the one that noted the time `begun`.
+    Both are 0 if the process `owner` has ended, or is another one, begun later than `begun`.
     """
     if not psutil:  # in a browser, where this is the only process
         return 0.0, int(owner == os.getpid())
@@ -198,7 +198,7 @@ def memory_of(owner: int, begun: float) -> tuple[float, int]:
     except psutil.Error:
         return 0.0, 0
     memory = 0.0
-    for one in family:
-        with contextlib.suppress(psutil.Error):  # it has just ended
-            memory += one.memory_info().rss / 2**20
+    for member in family:
+        with contextlib.suppress(psutil.Error):  # the process has just ended
+            memory += member.memory_info().rss / 2**20
     return memory, len(family)

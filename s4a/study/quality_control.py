@@ -1,7 +1,7 @@
-"""Shapes that may spoil a study: which are left out, which stand apart, and what is told of them.
+"""Quality control of a run: flag suspect shapes, and exclude them from the network and the modes.
 
-A shape is held against the others of its collection before anything is computed with it, by its
-eigenfunctions once it has some, and by its registration in the end.
+Shapes are compared with their collection before the computation, checked by their number of
+eigenfunctions, and in the end by their registration.
 """
 
 from collections.abc import Sequence
@@ -15,45 +15,46 @@ from s4a.options import Options
 from s4a.study.netcdf import arrays, attributes, open_file, read
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.store import task_key
-from s4a.study.tasks import compare_shape, portray_shape
+from s4a.study.tasks import compare_shape, describe_shape
 
-# registration_error: of one kind 0.02 to 0.03, in far poses 0.01 to 0.03, of a cat and a man 0.14
-# to 0.16
+# registration_error: 0.02 to 0.03 for shapes of one kind, 0.01 to 0.03 for large pose differences,
+# 0.14 to 0.16 between a cat and a man
 FLAGGED = 0.06
-# registration_error times mean |distortion|: of pairs of bodies and cats that are right 0.0002 to
-# 0.005, of those that failed 0.0033 to 0.08 (docs/plausibility.md)
+# registration_error times mean |distortion|: 0.0002 to 0.005 for correct pairs of bodies and cats,
+# 0.0033 to 0.08 for failed ones (docs/plausibility.md)
 WRONG, UNSURE = 0.0065, 0.004
-# and times the median of the collection, as coarse meshes raise the product of all shapes
-WRONG_BESIDE, UNSURE_BESIDE = 2.0, 1.5
+# the same over the median of the collection, as coarse meshes raise the product for all shapes
+WRONG_RATIO, UNSURE_RATIO = 2.0, 1.5
 
 
 def check_plausibility(run: Run, original: Keys, options: Options) -> tuple[Keys, Flags, list[str]]:
-    """What looks wrong with each shape beside the others, and with all of them.
+    """Compare the shapes with each other, and flag suspect ones.
 
     Returns
     -------
     original : dict of str to str
         Keys of the shapes that could be compared.
-    flags : dict of str to list of Doubt
+    flags : dict of str to list of Flag
     remarks : list of str
     """
     if len(original) < 2:
         return original, {}, []
     attrs = {n: attributes(run.folder / f"original/{n}.nc") for n in original}
-    looks = comparisons_of(run, original, options)
-    return {n: original[n] for n in looks}, *find_warnings({n: attrs[n] for n in looks}, looks)
+    compared = comparisons_of(run, original, options)
+    used = {n: attrs[n] for n in compared}
+    return {n: original[n] for n in compared}, *find_warnings(used, compared)
 
 
 def comparisons_of(run: Run, original: Keys, options: Options) -> dict[str, xr.Dataset]:
-    """What :func:`s4a.input.plausibility.compare` sees in each shape that could be compared."""
-    # how they are counted is part of the key: by PyMeshLab, as once, they were others
+    """:func:`s4a.input.plausibility.compare` each shape with the references."""
+    # the method of counting is part of the key
     settings = (can_count(options.intersections),)
     counted = ("exactly",) if settings[0] else settings
     todo = [
         Task(
             n,
             f"network/descriptor_{n}.nc",
-            portray_shape,
+            describe_shape,
             (run.folder, n, *settings),
             (key, counted),
         )
@@ -77,7 +78,7 @@ def comparisons_of(run: Run, original: Keys, options: Options) -> dict[str, xr.D
 
 
 def references_of(run: Run, descriptors: Keys, k: int) -> list[str]:
-    """The shapes beside which all are seen: of usual form, fine enough for k."""
+    """Choose the references: typical shapes with enough vertices for k."""
     vertices = {n: open_file(run.folder / f"original/{n}.nc").sizes["vertex"] for n in descriptors}
     least = usable_k(list(vertices.values()), k)
     fine = [name for name in descriptors if vertices[name] >= least]
@@ -87,17 +88,17 @@ def references_of(run: Run, descriptors: Keys, k: int) -> list[str]:
 
 
 def comparison_of(run: Run, name: str) -> xr.Dataset:
-    """What :func:`s4a.input.plausibility.compare` saw in a shape."""
+    """Read the comparison of a shape with the references."""
     return read(run.folder / f"network/comparison_{name}.nc")
 
 
 def stop_if_flagged(flags: Flags, options: Options) -> None:
-    """ValueError where a shape is flagged and the run shall stop at that."""
+    """Raise ValueError if a shape is flagged and ``quality_control="stop"``."""
     if options.quality_control != "stop":
         return
     kinds = {
-        name: " ".join(dict.fromkeys(flag.kind for flag in of_shape if flag.flagged))
-        for name, of_shape in flags.items()
+        name: " ".join(dict.fromkeys(flag.kind for flag in shape_flags if flag.flagged))
+        for name, shape_flags in flags.items()
         if name != options.template
     }
     kinds = {name: words for name, words in kinds.items() if words}
@@ -113,50 +114,50 @@ def stop_if_flagged(flags: Flags, options: Options) -> None:
 def exclude_flagged(
     run: Run, coarse: Keys, flags: Flags, options: Options
 ) -> tuple[Flags, Keys, Keys, list[str]]:
-    """The shapes that make the network, and the flagged ones, which stand apart from it.
+    """Split the shapes into those of the network and flagged ones, excluded from it.
 
-    Those with fewer eigenfunctions than most others are left out.  Where fewer than two are beyond
-    flag, none is flagged: there is nothing to hold them against.
+    Shapes with fewer eigenfunctions than most others fail.  If fewer than two shapes are not
+    flagged, there is no reference to compare with, and all flags are lifted.
 
     Returns
     -------
-    flags : dict of str to list of Doubt
-    coarse, apart : dict of str to str
+    flags : dict of str to list of Flag
+    coarse, excluded : dict of str to str
         Keys of the low-resolution meshes of both.
     remarks : list of str
     """
     count = {n: len(arrays(run.folder / f"coarse/{n}.nc", "eigenvalue")[0]) for n in coarse}
-    named = options.template  # who names a template trusts it
     is_flagged = {n: any(flag.flagged for flag in flags.get(n, [])) for n in coarse}
-    sure = [n for n in coarse if n == named or not is_flagged[n]]
+    # a template that the user names is trusted
+    trusted = [n for n in coarse if n == options.template or not is_flagged[n]]
     remarks = []
-    if len(sure) < 2:
+    if len(trusted) < 2:
         flags = {n: [flag._replace(flagged=False) for flag in flags.get(n, [])] for n in flags}
         if len(coarse) > 1:
             remarks = [
-                f"{len(coarse) - len(sure)} of {len(coarse)} shapes are flagged, and fewer than "
-                "two are not: all are treated alike"
+                f"{len(coarse) - len(trusted)} of {len(coarse)} shapes are flagged, and fewer than "
+                "two are not: all shapes are used"
             ]
-        sure = list(coarse)
-    k = usable_k([count[n] for n in sure], options.k)
-    enough = sum(count[n] >= k for n in sure)
+        trusted = list(coarse)
+    k = usable_k([count[n] for n in trusted], options.k)
+    n_enough = sum(count[n] >= k for n in trusted)
     for n in coarse:
         if count[n] < k:
             run.failures[n] = (
-                f"only {count[n]} eigenfunctions, where {enough} of {len(sure)} shapes have "
+                f"only {count[n]} eigenfunctions, but {n_enough} of {len(trusted)} shapes have "
                 f"{k} or more: give a finer mesh, or a smaller k"
             )
-    network = {n: coarse[n] for n in sure if count[n] >= k}
-    apart = {n: coarse[n] for n in coarse if n not in sure and count[n] >= k}
+    network = {n: coarse[n] for n in trusted if count[n] >= k}
+    excluded = {n: coarse[n] for n in coarse if n not in trusted and count[n] >= k}
     check_usable(run, network, options)
-    return flags, network, apart, remarks
+    return flags, network, excluded, remarks
 
 
 def usable_k(counts: Sequence[int], k: int) -> int:
-    """The size of maps that most shapes allow, by their numbers of eigenfunctions.
+    """Return the size of maps that most shapes allow, by their numbers of eigenfunctions.
 
-    It is k where most have as many.  Else it is the least number of those shapes that have at least
-    half of what is usual: few eigenfunctions of one shape are no reason to take them from all.
+    It is k if most shapes have that many, else the least number of the shapes that have at least
+    half of the median: one shape with few eigenfunctions does not reduce the maps of all.
 
     Examples
     --------
@@ -171,7 +172,7 @@ def usable_k(counts: Sequence[int], k: int) -> int:
 
 
 def check_usable(run: Run, coarse: Keys, options: Options) -> None:
-    """ValueError where too few shapes are left, or the template is not among them."""
+    """Raise ValueError if fewer than two shapes are left, or the template has failed."""
     if len(coarse) < 2:
         reasons = "; ".join(f"{name}: {why}" for name, why in run.failures.items())
         raise ValueError(
@@ -183,9 +184,9 @@ def check_usable(run: Run, coarse: Keys, options: Options) -> None:
         raise ValueError(f"template {options.template!r} cannot be used: {why}")
 
 
-def check_registrations(run: Run, registered: Keys, placed: Keys) -> tuple[Flags, list[str]]:
-    """What is flagged of the registrations within the network."""
-    names = [name for name in registered if name not in placed]
+def check_registrations(run: Run, registered: Keys, inserted: Keys) -> tuple[Flags, list[str]]:
+    """Flag the registrations of the network that are probably wrong; see :func:`flagged`."""
+    names = [name for name in registered if name not in inserted]
     files = {name: run.folder / f"registration/{name}.nc" for name in names}
     registration_error = {name: attributes(file)["score"] for name, file in files.items()}
     distortion = {
@@ -197,38 +198,38 @@ def check_registrations(run: Run, registered: Keys, placed: Keys) -> tuple[Flags
 def flagged(
     registration_error: dict[str, float], distortion: dict[str, float] | None = None
 ) -> tuple[Flags, list[str]]:
-    """Flags about the shapes whose registration scores badly, or for all of them.
+    """Flag shapes by their registration error, alone and times distortion.
 
     Parameters
     ----------
     registration_error : dict of str to float
         See :func:`s4a.method.spectral_icp.registration_score`.
     distortion : dict of str to float, optional
-        Mean size of the distortion.  A wrong map both misses the surface and distorts: the product
-        is told where neither number alone is.
+        Mean |distortion|.  A wrong map misses the surface and distorts, so the product separates
+        better than either number.
 
     Returns
     -------
-    of_shapes : dict of str to list of Doubt
-        Of the kind ``registration``; only names that have one.
-    of_all : list of str
-        In place of the former where most shapes are flagged: then the template or the options are.
+    flags : dict of str to list of Flag
+        Flags of the kind ``registration``, of suspect shapes only.
+    remarks : list of str
+        If most shapes are suspect, a remark on the template and options, and no flags.
 
     Examples
     --------
     >>> from s4a.study.quality_control import flagged
-    >>> of_shapes, of_all = flagged({"template": 0.0, "good": 0.02, "wrong": 0.12})
-    >>> list(of_shapes), of_all
+    >>> flags, remarks = flagged({"template": 0.0, "good": 0.02, "wrong": 0.12})
+    >>> list(flags), remarks
     (['wrong'], [])
     """
     distortion = distortion or {}
     product = {
         name: score * distortion.get(name, 0.0) for name, score in registration_error.items()
     }
-    usual = float(np.median([one for one in product.values() if one > 0] or [0.0]))
-    far, near = max(WRONG, WRONG_BESIDE * usual), max(UNSURE, UNSURE_BESIDE * usual)
+    usual = float(np.median([value for value in product.values() if value > 0] or [0.0]))
+    limit, warning_limit = max(WRONG, WRONG_RATIO * usual), max(UNSURE, UNSURE_RATIO * usual)
     wrong = {
-        n: score for n, score in registration_error.items() if score > FLAGGED or product[n] > far
+        n: score for n, score in registration_error.items() if score > FLAGGED or product[n] > limit
     }
     if len(registration_error) > 2 and len(wrong) > len(registration_error) / 2:
         return {}, [
@@ -236,14 +237,12 @@ def flagged(
             f"(registration_error {min(wrong.values()):.3f} to {max(wrong.values()):.3f}): "
             "try another template, a larger n_coarse or k"
         ]
-    found: Flags = {}
+    flags: Flags = {}
     for name, score in registration_error.items():
-        if name not in wrong and product[name] <= near:
+        if name not in wrong and product[name] <= warning_limit:
             continue
-        sure = "probably" if name in wrong else "maybe, in places,"
-        also = f", mean |distortion| {distortion[name]:.2f}" if name in distortion else ""
-        said = flag(
-            "registration", name in wrong, sure=sure, registration_error=score, distortion=also
-        )
-        found[name] = [said]
-    return found, []
+        sure = "probably" if name in wrong else "possibly, in parts,"
+        mean = f", mean |distortion| {distortion[name]:.2f}" if name in distortion else ""
+        values = {"sure": sure, "registration_error": score, "distortion": mean}
+        flags[name] = [flag("registration", name in wrong, **values)]
+    return flags, []

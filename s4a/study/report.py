@@ -1,7 +1,4 @@
-"""What a run has to say of itself: ``/report`` (4, 6.1).
-
-What was done to each shape, flagged registrations, numbers reduced to what there is, costs.
-"""
+"""Report of a run, ``/report`` (4, 6.1): repairs, flags, reduced options, costs."""
 
 from typing import Any
 
@@ -29,36 +26,36 @@ def write_report(
     registered: dict[str, str],
     flags: Flags,
 ) -> None:
-    """Write ``/report``: every shape, what looks wrong, what was reduced, costs and options.
+    """Write ``/report``: every shape, warnings, reduced options, costs and options.
 
     Parameters
     ----------
     run : Run
     sources : dict
-        Of all shapes that were given, see :func:`s4a.study.sources.find_sources`.
+        All shapes given, see :func:`s4a.study.sources.find_sources`.
     options : Options
     remarks : list of str
         On the collection, from earlier steps.
     no_modes : str
-        Why there are no modes; empty where there are.
+        Reason why there are no modes; empty if there are.
     registered : dict of str to str
         Keys of the registrations.
-    flags : dict of str to list of Doubt
-        About the registered shapes.
+    flags : dict of str to list of Flag
+        Flags of the registered shapes.
     """
     names = list(registered)
     template = attributes(run.folder / "registration.nc")["template"]
     network, latent = read(run.folder / "network.nc"), read(run.folder / "latent.nc")
-    together = latent["shape"].values.tolist()
-    spectra = {n: arrays(run.folder / f"coarse/{n}.nc", "eigenvalue")[0] for n in together}
+    in_network = latent["shape"].values.tolist()
+    spectra = {n: arrays(run.folder / f"coarse/{n}.nc", "eigenvalue")[0] for n in in_network}
     report = shape_report(
-        {name: of_shape(run, name, source, options) for name, (source, _) in sources.items()},
+        {name: shape_attrs(run, name, source, options) for name, (source, _) in sources.items()},
         flags,
         [
             *reduced_k(options.k, latent.sizes["eigenpair"], spectra),
             *remarks,
             *reduced_pairs(options.n_pairs, network.sizes["pair"] // 2, len(spectra)),
-            *tied(together, latent["distance_to_limit"].values),
+            *tied(in_network, latent["distance_to_limit"].values),
         ],
         {name: comparison_of(run, name) for name in names},
     )
@@ -69,18 +66,18 @@ def write_report(
         with_options({"template": template, "no_modes": no_modes}, vars(options))
     )
     report.attrs["unforeseen"] = " ".join(run.unforeseen)  # names of shapes, which have no blanks
-    of_template = report.sel(shape=template)
-    if of_template["status"].item() == "flagged":
+    template_row = report.sel(shape=template)
+    if template_row["status"].item() == "flagged":
         report.attrs["remarks"] += (
-            f"\nthe template {template}, which was named, is itself flagged "
-            f"({of_template['warning'].item()})"
+            f"\nthe template {template}, given by name, is flagged "
+            f"({template_row['warning'].item()})"
         )
     write(report, run.folder / "report.nc", made_from=registered.values())
 
 
-def of_shape(run: Run, name: str, source: str | xr.Dataset, options: Options) -> dict[str, Any]:
-    """Attributes of a shape for :func:`s4a.input.collection.shape_report`: what was done to it."""
-    path = {"path": source} if isinstance(source, str) else {}  # may have moved since it was read
+def shape_attrs(run: Run, name: str, source: str | xr.Dataset, options: Options) -> dict[str, Any]:
+    """Attributes of a shape for :func:`s4a.input.collection.shape_report`."""
+    path = {"path": source} if isinstance(source, str) else {}  # the file may have moved
     if name in run.failures:
         return {"status": "excluded", "reason": run.failures[name]} | path
     mesh, coarse = (
@@ -90,25 +87,24 @@ def of_shape(run: Run, name: str, source: str | xr.Dataset, options: Options) ->
     if coarse["wrapped"]:
         done.append("wrapped watertight before remeshing")
     if coarse["kept_whole"]:
-        done.append(f"all vertices are used, as there are fewer than n_coarse = {options.n_coarse}")
+        done.append(f"all vertices used, as there are fewer than n_coarse = {options.n_coarse}")
     if coarse["laplacian"] == "robust":
-        done.append("not manifold at low resolution: robust Laplacian")
+        done.append("not manifold at low resolution: robust Laplacian used")
     return mesh | {"reason": "; ".join(done)} | path
 
 
 def chirality_evidence(run: Run, names: list[str], options: Options) -> xr.Dataset:
-    """Which shapes were mirrored, and with ``reflect="auto"`` by how clear a hand."""
+    """Mirrored shapes and, with ``reflect="auto"``, mean chirality."""
     files = {name: run.folder / f"original/{name}.nc" for name in names}
     reflected = [
         n not in run.failures and bool(attributes(files[n]).get("reflected")) for n in names
     ]
-    found = dataset(reflected=np.array(reflected))
+    data = dataset(reflected=np.array(reflected))
     if options.reflect == AUTO:
         choice = read(run.folder / "network/chirality.nc")
-        found = found.merge(
-            dataset(mean_chirality=choice["mean_chirality"].reindex(shape=names).values)
-        )
-    return found
+        chirality = choice["mean_chirality"].reindex(shape=names).values
+        data = data.merge(dataset(mean_chirality=chirality))
+    return data
 
 
 def costs(run: Run) -> xr.Dataset:
@@ -117,15 +113,15 @@ def costs(run: Run) -> xr.Dataset:
     return dataset(seconds=seconds, peak_memory=memory).assign_coords(stage=list(run.costs))
 
 
-def reduced_k(asked: int, k: int, spectra: dict[str, Any]) -> list[str]:
-    """Whether the maps are smaller than was asked for, in words.
+def reduced_k(requested: int, k: int, spectra: dict[str, Any]) -> list[str]:
+    """Remark if the maps are smaller than requested.
 
     Parameters
     ----------
-    asked, k : int
-        Size of the maps that was asked for, and that was used.
+    requested, k : int
+        Requested size of the maps, and size used.
     spectra : dict of str to sequence
-        The eigenvalues of every shape.
+        Eigenvalues of every shape.
 
     Examples
     --------
@@ -133,18 +129,18 @@ def reduced_k(asked: int, k: int, spectra: dict[str, Any]) -> list[str]:
     >>> reduced_k(100, 57, {"a": range(80), "b": range(57), "c": range(100)})
     ['k = 100 reduced to 57, the eigenfunctions of b: 2 of 3 shapes have fewer than 100']
     """
-    if k >= asked:
+    if k >= requested:
         return []
     shortest = min(spectra, key=lambda name: len(spectra[name]))
-    fewer = sum(len(values) < asked for values in spectra.values())
+    fewer = sum(len(values) < requested for values in spectra.values())
     return [
-        f"k = {asked} reduced to {k}, the eigenfunctions of {shortest}: {fewer} of "
-        f"{len(spectra)} shapes have fewer than {asked}"
+        f"k = {requested} reduced to {k}, the eigenfunctions of {shortest}: {fewer} of "
+        f"{len(spectra)} shapes have fewer than {requested}"
     ]
 
 
-def reduced_pairs(asked: int, n_pairs: int, n: int) -> list[str]:
-    """Whether n shapes have fewer pairs than was asked for, in words.
+def reduced_pairs(requested: int, n_pairs: int, n: int) -> list[str]:
+    """Remark if n shapes have fewer pairs than requested.
 
     Examples
     --------
@@ -152,13 +148,13 @@ def reduced_pairs(asked: int, n_pairs: int, n: int) -> list[str]:
     >>> reduced_pairs(500, 3, 3)
     ['all 3 pairs of 3 shapes are used (n_pairs = 500)']
     """
-    if n_pairs >= asked:
+    if n_pairs >= requested:
         return []
-    return [f"all {n_pairs} pairs of {n} shapes are used (n_pairs = {asked})"]
+    return [f"all {n_pairs} pairs of {n} shapes are used (n_pairs = {requested})"]
 
 
 def tied(names: list[str], distance: np.ndarray, relative: float = 1e-6) -> list[str]:
-    """Whether the median shape is one of several, in words.
+    """Remark if several shapes are equally near the limit shape.
 
     Examples
     --------
@@ -173,5 +169,5 @@ def tied(names: list[str], distance: np.ndarray, relative: float = 1e-6) -> list
     always = " (of two shapes, always)" if len(names) == 2 else ""
     return [
         f"the median is not unique: {', '.join(near)} are equally near the limit shape{always}; "
-        "one of them was taken"
+        "one of them is used"
     ]

@@ -1,4 +1,4 @@
-"""Tasks of a run over a study folder (4): what is done already, processes, costs, failures."""
+"""Run the tasks of a study (4): skip finished ones, in parallel, with costs and failures."""
 
 import contextlib
 import faulthandler
@@ -26,27 +26,27 @@ from s4a.study.store import LOGS, Claim, open_without_following, task_key, write
 
 log = logging.getLogger(__name__)
 
-Keys = dict[str, str]  # name of a shape, or file of several -> key of what was computed
-LONGEST = len("align flagged shapes: ")  # of the names beside the progress bar
+Keys = dict[str, str]  # name of a shape, or file of several -> key of the result
+LONGEST = len("insert flagged shapes: ")  # longest text before the progress bar
 
 
 @dataclass(frozen=True)
 class Task:
-    """One file of a study: how it is computed, and all that it depends on.
+    """One file of a study, with its function and dependencies.
 
     Parameters
     ----------
     name : str
-        Of the shape, or of the file where it is of several shapes.
+        Name of the shape, or of the file if it is of several shapes.
     file : str
         Path in the folder of the study.
     function : callable
-        Gives the Dataset of the file from the `arguments`.
+        Function of the `arguments` that returns the Dataset of the file.
     arguments : tuple
     inputs : tuple
-        What the result depends on: keys of the tasks that it is made from, contents, parameters.
+        Dependencies of the result: keys of other tasks, contents, parameters.
     made_from : tuple of str
-        Keys of files without which :func:`s4a.open_study` leaves this one out.
+        Keys of files that :func:`s4a.open_study` needs to use this one.
 
     Examples
     --------
@@ -65,39 +65,39 @@ class Task:
 
     @property
     def key(self) -> str:
-        """The key of the result: of its inputs and the version of S4A."""
+        """Key of the result: a hash of its inputs and the version of S4A."""
         return task_key(*self.inputs)
 
     @property
     def log(self) -> str:
-        """The file in the folder of the study in which a task at work, or failed, is recorded."""
+        """Log file of the task in the folder of the study, while it runs or if it failed."""
         return f"{LOGS}/{self.file.replace('/', '-').removesuffix('.nc')}.txt"
 
     @property
     def see(self) -> str:
-        """Where its traceback is, in words."""
+        """Reference to the log file, for messages."""
         return f"see {self.log} in the folder of the study"
 
 
 class StageError(RuntimeError):
-    """A stage that needs all shapes cannot be done, for a reason that is not in the input."""
+    """A stage of all shapes failed for a reason other than the input."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a task.
+    """Outcome of a task.
 
     Parameters
     ----------
     name : str
-        Of the task.
+        Name of the task.
     failure : str
-        Why there is no file; empty where it was written.
+        Reason why there is no file; empty if it was written.
     unforeseen : bool
-        Whether that is none of the errors with which S4A refuses its input.
+        The failure is not an error of S4A about its input.
     pid : int
     memory : float
-        Peak of that process in MiB.
+        Peak memory of the process in MiB.
     """
 
     name: str
@@ -108,16 +108,16 @@ class Outcome:
 
 
 class Run:
-    """One run over a study folder: does what is not done yet, keeps time, memory and failures.
+    """A run over a study folder, with its costs and failures.
 
     Attributes
     ----------
     failures : dict of str to str
-        Name of a shape that is left out -> why.
+        Name of an excluded shape -> reason.
     unforeseen : list of str
-        Those of them whose files are not the reason.
+        Shapes that failed for a reason other than their files.
     costs : dict of str to tuple
-        Seconds and MiB of every stage, those of earlier runs over the folder included.
+        Seconds and MiB of every stage, in all runs over the folder.
     """
 
     def __init__(self, claim: Claim, n_jobs: int | None):
@@ -130,77 +130,81 @@ class Run:
         self.interrupted = threading.Event()
 
     @contextlib.contextmanager
-    def stage(self, name: str, share: float = 1.0, *, done: int = 0, of: int = 1) -> Iterator[None]:
-        """Time and peak memory of a stage (seconds; MiB, this process and its workers together).
+    def stage(
+        self, name: str, share: float = 1.0, *, done: int = 0, total: int = 1
+    ) -> Iterator[None]:
+        """Record time and peak memory (MiB, of this process and its workers) of a stage.
 
-        They are added to those of earlier runs over the folder where a `share` of the stage is left
-        to do, and take their place where all of it is.  Its end is one line of the log.
+        They are added to those of earlier runs if only a share of the stage is left to do, else
+        they replace them.
 
         Parameters
         ----------
         name : str
         share : float
-        done, of : int
-            How many of its tasks are done, of how many.
+            Share of the stage that is left to do.
+        done, total : int
+            Number of finished tasks, and of all tasks.
         """
         self.end_if_interrupted()
         begin, now = time.perf_counter(), time.time()
         self.doing, self.workers = name, {}
         before = self.costs.get(name, [0.0, 0.0]) if share < 1 else [0.0, 0.0]
-        self.notes.stages[name] = Stage(done, of, done, now, before[0], before[1], False)
+        self.notes.stages[name] = Stage(done, total, done, now, before[0], before[1], False)
         self.notes.write()
-        whole = False
+        completed = False
         try:
             yield
-            whole = True
-        finally:  # an interrupted stage has cost something too
+            completed = True
+        finally:  # an interrupted stage has costs too
             spent = time.perf_counter() - begin
             if share > 0 or name not in self.costs:
-                peak = together(self.workers, effective_n_jobs(self.n_jobs))
+                peak = total_memory(self.workers, effective_n_jobs(self.n_jobs))
                 self.costs[name] = [before[0] + spent, float(np.fmax(before[1], peak))]
-            n_done = of if whole else self.notes.stages[name].done
+            n_done = total if completed else self.notes.stages[name].done
             seconds, peak = self.costs[name]
-            self.notes.stages[name] = Stage(n_done, of, done, now, seconds, peak, whole)
+            self.notes.stages[name] = Stage(n_done, total, done, now, seconds, peak, completed)
             self.notes.write()
-        log.info("%s: %d of %d were to do, %.1f s, %.0f MiB", name, of - done, of, spent, peak)
+        text = "%s: %d of %d tasks computed, %.1f s, %.0f MiB"
+        log.info(text, name, total - done, total, spent, peak)
 
     def do(self, stage: str, tasks: list[Task], *, each: bool = True) -> Keys:
-        """Do the tasks whose file is not done; name -> key of all that are done then.
+        """Run the tasks whose file is not done; return name -> key of all finished tasks.
 
-        An error in a task is kept as a failure where the tasks are one for `each` shape, and raised
-        where all need all.  One of files (no room, no such file) is always raised: it is not of the
-        shape, and what is finished is kept.
+        With one task for `each` shape, an error is recorded as failure of the shape; else it is
+        raised.  Errors of the file system are always raised.  Finished files are kept.
         """
         missing = [task for task in tasks if not self.has(task)]
         n_done, share = len(tasks) - len(missing), len(missing) / max(len(tasks), 1)
-        with self.stage(stage, share, done=n_done, of=len(tasks)):
+        with self.stage(stage, share, done=n_done, total=len(tasks)):
             outcomes = self.outcomes(missing)
             if missing:
                 self.show(stage, len(missing))
-            for done in outcomes:
+            for outcome in outcomes:
                 self.end_if_interrupted()
-                self.workers[done.pid] = max(done.memory, self.workers.get(done.pid, 0))
-                if done.failure and not each:
-                    raise (StageError if done.unforeseen else ValueError)(
-                        f"{stage}: {done.failure}; what is finished is kept"
+                pid, memory = outcome.pid, outcome.memory
+                self.workers[pid] = max(memory, self.workers.get(pid, 0))
+                if outcome.failure and not each:
+                    raise (StageError if outcome.unforeseen else ValueError)(
+                        f"{stage}: {outcome.failure}; finished files are kept"
                     )
-                if done.unforeseen:
-                    log.warning("%s is left out: %s: %s", done.name, stage, done.failure)
-                    self.unforeseen.append(done.name)
-                if done.failure:
-                    self.failures[done.name] = f"{stage}: {done.failure}"
+                if outcome.unforeseen:
+                    log.warning("%s is excluded: %s: %s", outcome.name, stage, outcome.failure)
+                    self.unforeseen.append(outcome.name)
+                if outcome.failure:
+                    self.failures[outcome.name] = f"{stage}: {outcome.failure}"
                 self.notes.add(stage)
                 self.bar.update()
         return {task.name: task.key for task in tasks if task.name not in self.failures}
 
     def show(self, stage: str, total: int) -> tqdm:
-        """The progress bar, at the beginning of a stage: one for all, which goes with the run."""
+        """Reset the progress bar of the run at the beginning of a stage, and return it."""
         stage = f"{stage}: ".ljust(LONGEST)
         if self.bar is None:
-            # a line of the log for each stage instead, or nothing where warnings are off
-            in_lines = log.isEnabledFor(logging.INFO) or not log.isEnabledFor(logging.WARNING)
-            look = {"leave": False, "bar_format": "{desc}{percentage:3.0f}%|{bar}{r_bar}"}
-            self.bar = tqdm(desc=stage, total=total, disable=in_lines, **look)
+            # a log line for each stage instead, or nothing if warnings are off
+            is_off = log.isEnabledFor(logging.INFO) or not log.isEnabledFor(logging.WARNING)
+            style = {"leave": False, "bar_format": "{desc}{percentage:3.0f}%|{bar}{r_bar}"}
+            self.bar = tqdm(desc=stage, total=total, disable=is_off, **style)
             if box := getattr(self.bar, "container", None):  # in a notebook
                 box.children[0].layout.width = "17em"
         self.bar.set_description_str(stage, refresh=False)
@@ -208,10 +212,10 @@ class Run:
         return self.bar
 
     def outcomes(self, tasks: list[Task]) -> Iterator[Outcome]:
-        """Do the tasks side by side.
+        """Run the tasks in parallel.
 
-        When a worker dies, joblib ends the others too.  Those that were at work then come one at a
-        time, until one dies alone: that one has failed, and the rest go on side by side.
+        If a worker dies, joblib ends the others too.  The tasks that were running are then repeated
+        one at a time until one dies again.  That task has failed, and the others run in parallel.
         """
         todo = {task.name: task for task in tasks}
         suspects: list[str] = []
@@ -224,7 +228,7 @@ class Run:
                     yield delayed(do_task)(todo[name], self.claim)
 
             n_jobs = max(2, effective_n_jobs(self.n_jobs)) if alone else self.n_jobs
-            # meshes in memory go through the pipe: files to share them would outlive a killed run
+            # meshes in memory are sent through a pipe, as shared files would outlive a killed run
             parallel = workers(n_jobs, return_as="generator_unordered", max_nbytes=None)
             try:
                 for outcome in parallel(jobs()):
@@ -237,8 +241,8 @@ class Run:
                     raise
                 if not begun:
                     raise StageError(f"processes die before they begin ({how})") from error
-                for name in [one for one in begun if one in todo and self.has(todo[one])]:
-                    yield Outcome(todo.pop(name).name)  # its process died before it could say so
+                for name in [name for name in begun if name in todo and self.has(todo[name])]:
+                    yield Outcome(todo.pop(name).name)  # the process died after writing the file
                 suspects = [name for name in begun if name in todo]
                 if alone and suspects:
                     failure = f"its process died ({how}); {todo.pop(alone[0]).see}"
@@ -246,19 +250,19 @@ class Run:
                     suspects = []
 
     def end_if_interrupted(self) -> None:
-        """KeyboardInterrupt where Ctrl-C was asked for, and that of Python was lost."""
+        """Raise KeyboardInterrupt after Ctrl-C, if the exception of Python was lost."""
         if self.interrupted.is_set():
             raise KeyboardInterrupt
 
     def has(self, task: Task) -> bool:
-        """Whether the file of a task is there, whole and of this key."""
+        """Return whether the file of a task exists, undamaged and with this key."""
         return is_done(self.folder / task.file, task.key)
 
     @contextlib.contextmanager
     def report_unforeseen(self) -> Iterator[None]:
-        """An error that nobody foresaw becomes a StageError, its traceback a file of the study.
+        """Turn an unforeseen error into a StageError, with the traceback in a file of the study.
 
-        The progress bar is gone at the end.
+        The progress bar is closed at the end.
         """
         file = self.folder / LOGS / "run.txt"
         file.unlink(missing_ok=True)
@@ -267,7 +271,7 @@ class Run:
                 yield
             self.notes.write("finished")
         except (ValueError, OSError, StageError):
-            self.end_if_interrupted()  # it may be what became of it
+            self.end_if_interrupted()  # the interrupt may be the cause
             raise
         except Exception as error:
             self.end_if_interrupted()
@@ -284,7 +288,7 @@ class Run:
 
 
 def do_task(task: Task, claim: Claim) -> Outcome:
-    """Compute one Dataset and write its file; with one BLAS thread, as tasks run side by side."""
+    """Compute one Dataset and write its file, with one BLAS thread, as tasks run in parallel."""
     claim.check()
     file = claim.folder / task.log
     failure, unforeseen = "", False
@@ -293,9 +297,9 @@ def do_task(task: Task, claim: Claim) -> Outcome:
             with threadpool_limits(1):
                 data = task.function(*task.arguments)
             write(data, claim.folder / task.file, task.key, task.made_from, claim)
-        except OSError:  # of the folder or of the disk, not of the shape
+        except OSError:  # of the folder or the disk, not of the shape
             raise
-        except (Exception, SystemExit) as error:  # whatever it is, it costs this task only
+        except (Exception, SystemExit) as error:  # any error stops this task only
             claim.check()
             text, unforeseen = traceback.format_exc(), not isinstance(error, ValueError)
             failure = f"{in_a_line(error)}; {task.see}" if unforeseen else str(error)
@@ -305,7 +309,7 @@ def do_task(task: Task, claim: Claim) -> Outcome:
 
 
 def in_a_line(error: BaseException) -> str:
-    """Kind and text of an error.
+    """Format type and text of an error in one line.
 
     Examples
     --------
@@ -318,8 +322,8 @@ def in_a_line(error: BaseException) -> str:
 
 
 def note(file: Path, text: str) -> None:
-    """Write a file of the log, in place of what it said before."""
-    with contextlib.suppress(OSError):  # the disk may be what the error is about
+    """Write a log file, replacing its content."""
+    with contextlib.suppress(OSError):  # the disk may be the cause of the error
         file.parent.mkdir(parents=True, exist_ok=True)
         with open(file, "w", encoding="utf-8", opener=open_without_following) as log_of_task:
             log_of_task.write(text)
@@ -327,37 +331,37 @@ def note(file: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def at_work(file: Path, claim: Claim) -> Iterator[None]:
-    """Record a task while a worker is at it; the record stays only where its process dies.
+    """Keep a log file while a task runs; it remains only if the process dies.
 
-    It then says where, if the system let it: that of a segmentation fault.
+    After a segmentation fault it has the traceback.
     """
     with contextlib.ExitStack() as stack:
         stack.callback(file.unlink, missing_ok=True)
         if os.getppid() == claim.owner:
             note(file, f"begun by process {os.getpid()}, {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
-            with contextlib.suppress(OSError):  # what the task writes will tell
+            with contextlib.suppress(OSError):  # writing the result will raise the error
                 record = open(file, "a", encoding="utf-8", opener=open_without_following)
                 faulthandler.enable(stack.enter_context(record))
-                stack.callback(faulthandler.enable)  # on the error stream, as joblib has it
+                stack.callback(faulthandler.enable)  # on the error stream again, as in joblib
         yield
 
 
-def together(peaks: dict[int, float], n_jobs: int) -> float:
-    """MiB of this process and its workers at most: of the largest where some took others' places.
+def total_memory(peaks: dict[int, float], n_jobs: int) -> float:
+    """Peak memory (MiB) of this process and its workers, at most.
 
     Parameters
     ----------
     peaks : dict of int to float
-        Of every worker that there was, by its number; this process may be among them.
+        Peak of every worker by process; this process may be among them.
     n_jobs : int
-        How many there were at once.
+        Number of simultaneous workers; the largest are counted.
     """
     others = sorted(memory for pid, memory in peaks.items() if pid != os.getpid())
     return peak_memory() + sum(others[-n_jobs:])
 
 
 def peak_memory() -> float:
-    """Peak resident memory of this process in MiB; nan where the system does not say."""
+    """Peak resident memory of this process in MiB; NaN if unknown."""
     try:
         import resource
     except ImportError:  # on Windows, and in a browser

@@ -1,8 +1,8 @@
-"""Files of a study, one netCDF file per task; keys, and the lock of its folder.
+"""Folder of a study: one netCDF file per task, keys, and a lock.
 
-Every file is written under a temporary name and renamed, so that a killed run leaves only whole
-files; the key of its task (content, parameters, version) stands in its attributes and says whether
-it is still valid.  Checksums (:mod:`s4a.study.netcdf`) say whether it is still what was written.
+Every file is written under a temporary name and renamed, so a killed run leaves only complete
+files.  The key of the task (content, parameters, version) in the attributes says whether a file is
+valid; checksums (:mod:`s4a.study.netcdf`) say whether it is undamaged.
 """
 
 import hashlib
@@ -23,22 +23,22 @@ import numpy as np
 import xarray as xr
 
 from s4a.study.netcdf import GROUP, open_hdf5, write_netcdf
-from s4a.study.processes import hold, remove_remains
+from s4a.study.processes import remove_remains, try_lock
 
 log = logging.getLogger(__name__)
 
 LOCK = ".lock"
 # folders of a study
 STAGES = ("original", "coarse", "network", "latent", "iterations", "registration", "fields")
-OF_ALL = ("network", "latent", "registration", "pca", "subjects", "report")  # files beside them
-LOGS = ".log"  # folder in that of a study: a file for each task that is at work or failed
-TEMPORARY = re.compile(r"\.[\w-]+\.nc\.\d+\.tmp")  # as `write` names them
+OF_ALL = ("network", "latent", "registration", "pca", "subjects", "report")  # other files
+LOGS = ".log"  # folder with a file for each task that is running or has failed
+TEMPORARY = re.compile(r"\.[\w-]+\.nc\.\d+\.tmp")  # temporary names of `write`
 
 VERSION = version("s4a")
 
 
 def task_key(*parts: Any) -> str:
-    """A hash of all that a result depends on, and of the version of S4A.
+    """Hash of everything that a result depends on, and of the version of S4A.
 
     Parameters
     ----------
@@ -56,37 +56,34 @@ def task_key(*parts: Any) -> str:
             kind, data = f"{part.dtype.str}{part.shape}", np.ascontiguousarray(part).tobytes()
         elif isinstance(part, bytes):
             kind, data = "bytes", part
-        else:  # numbers of NumPy as those of Python
+        else:  # numbers of NumPy become those of Python
             text = json.dumps(part, sort_keys=True, default=lambda number: number.item())
             kind, data = "json", text.encode()
-        # kind and length before it: "ab" is not "a", "b", and no array is the text of its bytes
+        # with kind and length, "ab" differs from "a", "b", and an array from the text of its bytes
         digest.update(f"{kind} {len(data)}:".encode() + data)
     return digest.hexdigest()[:32]
 
 
 @dataclass(frozen=True)
 class Claim:
-    """The right of one run to write into a folder, as it stands in its lock.
-
-    It travels to the workers.
-    """
+    """The right of a run to write into a folder, as recorded in the lock; passed to workers."""
 
     folder: Path
-    token: str  # number of the process, and a word that no other run has
+    token: str  # process id and a unique word
 
     @property
     def owner(self) -> int:
-        """Number of the process of the run."""
+        """Process id of the run."""
         return int(self.token.split()[0])
 
     def check(self) -> None:
-        """Raise ValueError when another run has taken over the folder, as after one was killed."""
+        """Raise ValueError if another run has taken over the folder, as after a kill."""
         try:
             token = (self.folder / LOCK).read_text()
         except OSError:
             token = ""
         if token != self.token:
-            raise ValueError(f"the run of process {self.owner} no longer holds {self.folder}")
+            raise ValueError(f"process {self.owner} no longer has the lock of {self.folder}")
 
 
 def write(
@@ -97,19 +94,19 @@ def write(
     claim: Claim | None = None,
     compression: int = 0,
 ) -> None:
-    """Write a file at once: under a temporary name in the same folder, then renamed.
+    """Write a file atomically, under a temporary name that is then renamed.
 
     Parameters
     ----------
     data : Dataset or DataTree
     path : Path or str
     key : str
-        Of :func:`task_key`.
+        See :func:`task_key`.
     made_from : iterable of str
-        Keys of the files that it was computed from; :func:`s4a.open_study` leaves a file out when
-        one of them is no longer there, as after a run with other options was stopped half-way.
+        Keys of the files that it was computed from; :func:`s4a.open_study` skips a file if one of
+        them is missing, as after an incomplete run with other options.
     claim : Claim, optional
-        Nothing is written when it no longer holds.
+        Write only if the claim is still valid.
     compression : int
         See :func:`s4a.study.netcdf.write_netcdf`.
     """
@@ -117,21 +114,21 @@ def write(
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     data = data.copy(deep=False)
     data.attrs = data.attrs | {"task_key": key, "made_from": " ".join(made_from)}
-    whole = io.BytesIO()  # HDF5 brings the process down when the disk is full
-    write_netcdf(data, whole, compression)
+    buffer = io.BytesIO()  # HDF5 crashes the process if the disk is full
+    write_netcdf(data, buffer, compression)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:
-            file.write(whole.getbuffer())
+            file.write(buffer.getbuffer())
             file.flush()
-            os.fsync(file.fileno())  # or a power cut leaves its name and not its content
+            os.fsync(file.fileno())  # otherwise a power cut may leave an empty file
         if claim is not None:
             claim.check()
-        os.replace(temporary, path)  # at once, or not at all
+        os.replace(temporary, path)  # atomic
     except OSError as error:
         raise OSError(
             f"{path} cannot be written ({error}): is the disk full, or the folder read-only? "
-            "Finished files are whole; the same command goes on where it stopped"
+            "Finished files are kept; the same command resumes the run"
         ) from error
     finally:
         with suppress(OSError):
@@ -139,7 +136,7 @@ def write(
 
 
 def refuse_links(folder: Path) -> None:
-    """ValueError where a folder within a study is a symbolic link; the study itself may be one."""
+    """Raise ValueError if a folder within a study is a symbolic link; the study may be one."""
     for name in (*STAGES, LOGS, *(f"{LOGS}/{stage}" for stage in STAGES)):
         if (folder / name).is_symlink():
             raise ValueError(
@@ -149,11 +146,11 @@ def refuse_links(folder: Path) -> None:
 
 
 def check_is_study(folder: Path) -> None:
-    """ValueError unless a folder is a study, and none within it is a link."""
+    """Raise ValueError unless a folder is a study, without links to folders."""
     if not (folder / STAGES[0]).is_dir():
         if inner := sorted(folder.glob(f"*/*/{STAGES[0]}")):
             raise ValueError(
-                f"{folder} has studies in it: give one of them, such as {inner[0].parent}"
+                f"{folder} contains studies: give one of them, such as {inner[0].parent}"
             )
         if not folder.is_dir():
             raise ValueError(
@@ -168,15 +165,15 @@ def check_is_study(folder: Path) -> None:
 
 
 def check_own(folder: Path) -> None:
-    """ValueError where a folder holds files and is no study: a run would write among them.
+    """Raise ValueError if a folder is not empty and not a study.
 
-    A study has its lock, or files that :func:`write` has written.
+    A study has a lock, or files written by :func:`write`.
     """
     refuse_links(folder)
     for name in OF_ALL:
         if is_ours(folder / f"{name}.nc") is False:
             raise ValueError(
-                f"{folder / name}.nc was not made by s4a, and a run would write in its place: "
+                f"{folder / name}.nc was not made by s4a, and a run would replace it: "
                 "move it away, or give another folder"
             )
     if not folder.is_dir() or (folder / LOCK).is_file():
@@ -186,12 +183,12 @@ def check_own(folder: Path) -> None:
     if names and not any(is_ours(path) for path in files):
         shown = ", ".join(names[:3]) + ", ..." * (len(names) > 3)
         raise ValueError(
-            f"{folder} is no study and is not empty (it has {shown}): give a new or an empty folder"
+            f"{folder} is not a study and not empty (it has {shown}): give a new or an empty folder"
         )
 
 
 def is_ours(path: Path) -> bool | None:
-    """Whether :func:`write` has written a file; None where it is absent or cannot be read."""
+    """Return whether :func:`write` has written a file; None if it is missing or unreadable."""
     try:
         with open_hdf5(path) as file:
             return file.links.exists(GROUP.encode())
@@ -200,17 +197,16 @@ def is_ours(path: Path) -> bool | None:
 
 
 def open_without_following(path: str, flags: int) -> int:
-    """Open a file of our own: where a symbolic link lies in its place, that is an OSError."""
+    """Open a file for writing; OSError if it is a symbolic link."""
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 @contextmanager
 def lock(folder: Path | str) -> Iterator[Claim]:
-    """Hold a study folder against a second run.
+    """Lock a study folder against a second run.
 
-    Released by the system when the process ends in whatever way.  Temporary files of processes that
-    were killed are removed when it begins and when it ends; a folder with files of somebody else
-    is not touched.
+    The system releases the lock when the process ends, even if it is killed.  Temporary files of
+    killed processes are removed at the beginning and the end.
 
     Yields
     ------
@@ -219,8 +215,7 @@ def lock(folder: Path | str) -> Iterator[Claim]:
     Raises
     ------
     ValueError
-        When another process holds the folder; its number is named.  When it is no study, and not
-        empty.
+        If another process has locked the folder, or the folder is not a study and not empty.
     """
     check_own(Path(folder))
     try:
@@ -230,8 +225,8 @@ def lock(folder: Path | str) -> Iterator[Claim]:
         raise OSError(f"{folder} cannot be written ({error}): give another folder") from error
     with handle:
         try:
-            if not hold(handle.fileno()):
-                log.warning("this system cannot lock %s; start no second run in it", folder)
+            if not try_lock(handle.fileno()):
+                log.warning("this system cannot lock %s; do not start a second run in it", folder)
         except OSError:
             handle.seek(0)
             owner, *_ = handle.read().split() or ["unknown"]
@@ -245,19 +240,19 @@ def lock(folder: Path | str) -> Iterator[Claim]:
         handle.truncate(0)
         handle.write(token)
         handle.flush()
-        os.fsync(handle.fileno())  # it says that the folder is a study, after a power cut too
+        os.fsync(handle.fileno())  # it identifies the study, even after a power cut
         remove_temporary(Path(folder))
         claim = Claim(Path(folder), token)
         try:
             yield claim
-        finally:  # where a task fails, the workers beside it are killed, in the midst of a file too
+        finally:  # if a task fails, other workers are killed, perhaps while writing
             with suppress(ValueError, OSError):
                 claim.check()
                 remove_temporary(Path(folder))
 
 
 def remove_temporary(folder: Path) -> None:
-    """Remove what :func:`write` had begun and not finished, when nobody writes any more."""
+    """Remove unfinished files of :func:`write`; no process may be writing."""
     for stage in ("", *STAGES):
         for temporary in (folder / stage).glob(".*.nc.*.tmp"):
             if TEMPORARY.fullmatch(temporary.name):

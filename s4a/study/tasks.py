@@ -1,6 +1,6 @@
-"""What a worker computes, one file of a study at a time: the steps of 4 for a shape or some pairs.
+"""Functions of the tasks of a run (4): each computes one file of a study.
 
-A task gets paths and names, reads the files of earlier tasks, and returns the Dataset of its own.
+A task gets paths and names, reads the files of earlier tasks, and returns a Dataset.
 """
 
 from collections.abc import Iterator
@@ -37,12 +37,11 @@ last_template: dict[tuple[Any, ...], Shape] = {}  # at most one
 def clean_shape(
     source: str | xr.Dataset, content: str, cleaning: dict[str, Any], also: dict[str, Any]
 ) -> xr.Dataset:
-    """A file read and cleaned, or a mesh in memory cleaned where it is not yet.
+    """Read and clean a file, or clean a mesh in memory if necessary.
 
-    With landmarks and fields, files and the keys of their contents, and its mirror image where
-    `also` says so.
-
-    OSError where a file no longer has the content of its key, which the result would bear.
+    `also` may have ``guides``, files of landmarks and fields with the keys of their contents, and
+    ``reflected`` to mirror the shape.  Raises OSError if a file has changed since its key was
+    computed.
     """
     mesh = cleaned(source, content, cleaning)
     guides = also.get("guides", NO_GUIDES)
@@ -61,16 +60,16 @@ def clean_shape(
 
 @contextmanager
 def unchanged(path: str, content: str) -> Iterator[None]:
-    """OSError where afterwards a file has no longer the content of that key."""
+    """Raise OSError at the end if a file no longer has the content of its key."""
     try:
         yield
     finally:
         if content_of_file(path) != content:
-            raise OSError(f"{path} has changed or gone since the run began: start it again")
+            raise OSError(f"{path} changed or disappeared since the run began: start it again")
 
 
 def cleaned(source: str | xr.Dataset, content: str, cleaning: dict[str, Any]) -> xr.Dataset:
-    """:func:`clean_shape` alone, with landmarks where a mesh in memory has some."""
+    """Read and clean a shape, without landmark files; a mesh in memory keeps its landmarks."""
     if isinstance(source, str):
         with unchanged(source, content):
             return read_shape(source, **cleaning)
@@ -85,8 +84,8 @@ def cleaned(source: str | xr.Dataset, content: str, cleaning: dict[str, Any]) ->
 
 
 def guided(mesh: xr.Dataset, source: xr.Dataset) -> xr.Dataset:
-    """A clean mesh with landmarks, fields and labels of the mesh in memory it was made from."""
-    if "guide_position" in source:  # its triangles are others now
+    """Transfer landmarks, fields and labels of a mesh in memory to the cleaned mesh."""
+    if "guide_position" in source:  # triangles have changed
         mesh = with_landmarks(mesh, guides_of(source))
     if features_of(source):
         weight = source["feature_weight"].values[0]
@@ -97,26 +96,26 @@ def guided(mesh: xr.Dataset, source: xr.Dataset) -> xr.Dataset:
     return mesh
 
 
-def portray_shape(folder: Path, name: str, intersections: bool) -> xr.Dataset:
-    """What :func:`s4a.input.plausibility.describe` sees in a shape."""
+def describe_shape(folder: Path, name: str, intersections: bool) -> xr.Dataset:
+    """Compute the descriptor of a shape."""
     return plausibility.describe(read(folder / f"original/{name}.nc"), intersections=intersections)
 
 
 def compare_shape(folder: Path, name: str, references: list[str]) -> xr.Dataset:
-    """What :func:`s4a.input.plausibility.compare` sees in a shape beside the references."""
+    """Compare a shape with the references."""
     descriptors = {n: read(folder / f"network/descriptor_{n}.nc") for n in {*references, name}}
     return plausibility.compare(name, descriptors[name], {n: descriptors[n] for n in references})
 
 
 def remesh_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
-    """The low-resolution mesh of a shape of the study, its U (4.1) and its spectrum (3.3)."""
+    """Compute the low-resolution mesh of a shape, U (4.1) and spectrum (3.3)."""
     mesh = read(folder / "original" / f"{name}.nc")
     low = low_resolution(mesh, **options.of("low resolution"))
     return in_unit(low, unit_of(mesh["position"]))
 
 
 class Folder(steps.Study):
-    """The nodes of a study in a folder; their arrays are read when they are used."""
+    """Nodes of a study in a folder; arrays are read when they are used."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -129,7 +128,7 @@ class Folder(steps.Study):
 
 
 def template_of(folder: Path, name: str, options: Options) -> Shape:
-    """The template at both resolutions; a process keeps the last, with what it computed of it."""
+    """Read the template at both resolutions; a process caches the last one."""
     shape = steps.shape_in(Folder(folder), name, **options.of("projection"))
     written = (mesh.attrs["task_key"] for mesh in (shape.original, shape.coarse))
     key = (folder, name, shape.n_projected, shape.area_weighted, *written)
@@ -139,7 +138,7 @@ def template_of(folder: Path, name: str, options: Options) -> Shape:
 
 
 def align_shape(folder: Path, name: str, reference: str) -> xr.Dataset:
-    """Rigid transform of a shape onto the reference, centred and of unit area (4.1, step 2)."""
+    """Compute the rigid transform of a shape onto the reference, of unit area (4.1, step 2)."""
     R, t = np.eye(3), np.zeros(3)
     if name != reference:
         R, t = transform_onto(*(steps.basis_in(Folder(folder), n) for n in (name, reference)))
@@ -147,7 +146,7 @@ def align_shape(folder: Path, name: str, reference: str) -> xr.Dataset:
 
 
 def map_pairs(folder: Path, pairs: list[Any], k_init: int, options: dict[str, Any]) -> xr.Dataset:
-    """Initial maps of some pairs, in both directions (4.1, steps 3 and 4)."""
+    """Compute initial maps of some pairs, in both directions (4.1, steps 3 and 4)."""
     study, names = Folder(folder), sorted({name for pair in pairs for name in pair})
     bases = {name: steps.basis_in(study, name) for name in names}
     transforms = {name: steps.transform_in(study, name) for name in names}
@@ -155,20 +154,20 @@ def map_pairs(folder: Path, pairs: list[Any], k_init: int, options: dict[str, An
 
 
 def consistent_maps(
-    run: Run, names: list[str], first: xr.Dataset, options: Options, n_jobs: int
+    run: Run, names: list[str], initial: xr.Dataset, options: Options, n_jobs: int
 ) -> xr.DataTree:
-    """Consistent ZoomOut over the network and the median (4.2): ``/network`` and ``/latent``."""
+    """Refine the network by Consistent ZoomOut (4.2): ``/network`` and ``/latent``."""
     study = Folder(run.folder)
     transforms = {name: steps.transform_in(study, name) for name in names}
     reference = study[f"network/alignment_{names[0]}"].attrs["reference"]
-    first = steps.with_transforms(first, transforms, reference)
+    initial = steps.with_transforms(initial, transforms, reference)
     coarse = {name: study[f"coarse/{name}"] for name in names}
-    k_init = first.sizes["eigenpair_source_initial"]
+    k_init = initial.sizes["eigenpair_source_initial"]
     k = min(options.k, *(mesh.sizes["eigenpair"] for mesh in coarse.values()))
     bar = run.show("consistent ZoomOut", k - k_init)
     return steps.refine_network(
         coarse,
-        first,
+        initial,
         k=options.k,
         step=options.step,
         n_latent=options.n_latent,
@@ -182,8 +181,8 @@ def consistent_maps(
     )
 
 
-def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
-    """The latent basis of a shape that stands apart from the network, which stays as it is."""
+def insert_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
+    """Compute the latent basis of a shape that is excluded from the network, which is fixed."""
     study = Folder(folder)
     latent, basis = read(folder / "latent.nc"), steps.basis_in(study, name)
     median, transform = latent.attrs["median"], steps.transform_in(study, name)
@@ -204,7 +203,7 @@ def place_shape(folder: Path, name: str, options: Options) -> xr.Dataset:
 
 
 def register_shape(folder: Path, name: str, template: str, options: Options) -> xr.Dataset:
-    """One shape registered to the template: eq. 6 at low resolution, then eq. 7 or eq. 3 and 4."""
+    """Register a shape to the template: eq. 6 at low resolution, then eq. 7 or eq. 3 and 4."""
     target = template_of(folder, template, options)
     settings = {"dense_match": options.dense_match, **options.of("registration")}
     return steps.register_in(Folder(folder), name, template, target, **settings)

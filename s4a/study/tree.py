@@ -1,4 +1,4 @@
-"""A study as one tree: opened from its folder, or put together from the registrations of shapes."""
+"""Studies as trees: open a folder, or combine the registrations of shapes."""
 
 import logging
 from collections.abc import Callable, Iterable
@@ -35,7 +35,7 @@ STACKED = (
 
 
 def template_mesh(original: xr.Dataset, name: str) -> xr.Dataset:
-    """The mesh of ``/registration`` from the original mesh of the template of that name."""
+    """Make the mesh of ``/registration`` from the original mesh of the template."""
     X, T = as_arrays(original)
     mesh = as_dataset(X, T, {"template": name}, vertex_area=vertex_areas(X, T))
     return in_unit(mesh, unit_of(original["position"]))
@@ -44,35 +44,34 @@ def template_mesh(original: xr.Dataset, name: str) -> xr.Dataset:
 def stack_registration(
     template: xr.Dataset, files: dict[str, xr.Dataset], names: list[str], *, lazily: bool = False
 ) -> dict[str, xr.Dataset]:
-    """``/registration``, rectangular, and below it the way back of each shape.
+    """Stack registrations to ``/registration``, with the inverse match of each shape below it.
 
-    Its lengths have a unit where all shapes say the same.
+    Lengths have a unit if it is the same for all shapes.
 
     Parameters
     ----------
     template : Dataset
-        Of :func:`template_mesh`.
+        See :func:`template_mesh`.
     files : dict of str to Dataset
         Registrations, see :func:`s4a.method.register.registration`.
     names : list of str
         The shapes in order.
     lazily : bool
-        Whether a variable is read from its files when it is used, only those of the shapes that are
-        asked for, or is in memory now.
+        Read variables when they are used, only for the shapes selected; else now.
     """
     shapes = [files[name] for name in names]
     mesh = template[[v for v in ("position", "corner_vertex", "vertex_area") if v in template]]
-    kept = ("template", "excluded")
-    attrs = {key: template.attrs[key] for key in kept if key in template.attrs}
+    copied = ("template", "excluded")
+    attrs = {key: template.attrs[key] for key in copied if key in template.attrs}
     data = mesh.assign_attrs(attrs)
     for name in STACKED:
         if all(name in shape for shape in shapes):
-            each = [shape[name].variable for shape in shapes]
+            values = [shape[name].variable for shape in shapes]
             if lazily:
-                like = variable(name, np.broadcast_to(0, (len(each), *each[0].shape)))
-                data[name] = xr.Variable(like.dims, stacked(each), like.attrs)
+                like = variable(name, np.broadcast_to(0, (len(values), *values[0].shape)))
+                data[name] = xr.Variable(like.dims, stacked(values), like.attrs)
             else:
-                data[name] = variable(name, np.stack([one.values for one in each]))
+                data[name] = variable(name, np.stack([value.values for value in values]))
     data["initialisation"] = variable(
         "initialisation", [shape.attrs.get("initialisation", "") for shape in shapes]
     )
@@ -89,31 +88,31 @@ def stack_registration(
 
 
 class Reader:
-    """Reads the files of a folder that belong together, and says which ones it leaves out.
+    """Reader of the matching files of a folder; files that it skips are logged.
 
     Parameters
     ----------
     folder : Path
     reported : set of str, optional
-        Shapes of the last run.  A damaged file of another shape is left out, as one that an earlier
-        run has left; any other is an error.
+        Shapes of the last run.  A damaged file of another shape, left by an earlier run, is
+        skipped; any other is an error.
     """
 
     def __init__(self, folder: Path, reported: set[str] | None = None):
         self.folder, self.reported = folder, reported
-        # of the files that were read; None where that is not to be asked
+        # keys of the files that were read; None if they are not checked
         self.keys: set[str] | None = set()
         self.files: dict[str, xr.Dataset] = {}
 
     def read(
         self, names: Iterable[str], open_with: Callable[..., xr.Dataset] = open_file
     ) -> dict[str, xr.Dataset]:
-        """The files of these names that are there and made from files read before.
+        """Read the files of these names that exist and were made from files read before.
 
         Raises
         ------
         DamagedError
-            Where one is not what a run wrote, or does not fit to the others.
+            If a file is damaged, or does not match the others.
         """
         files = {}
         for name in names:
@@ -125,7 +124,7 @@ class Reader:
                 shape = name.partition("/")[2]
                 if not shape or self.reported is None or shape in self.reported:
                     raise
-                log.warning("%s; it is left out", error)
+                log.warning("%s; it is skipped", error)
                 continue
             if fault:
                 log.warning("%s %s", self.path(name), fault)
@@ -134,13 +133,13 @@ class Reader:
         return files
 
     def path(self, name: str) -> Path:
-        """The file of that name, as ``coarse/brain_01``."""
+        """Path of a file, given its name as ``coarse/brain_01``."""
         return self.folder / f"{name}.nc"
 
     def open(self, name: str, open_with: Callable[..., xr.Dataset]) -> tuple[xr.Dataset, str]:
-        """A file, whose contents are checked, and why it has no place in the study if so."""
+        """Open and check a file; return it, and the reason if it is not part of the study."""
         path = self.path(name)
-        others = {}  # the way back points into the triangles of the template
+        others = {}  # the inverse match refers to triangles of the template
         if name.startswith("registration/") and "registration" in self.files:
             others["triangle"] = self.files["registration"].sizes["triangle"]
         data = open_with(path, others)
@@ -156,29 +155,28 @@ class Reader:
         return data, fault
 
     def fault(self, data: xr.Dataset) -> str:
-        """Why a file has no place in the study; empty where it has."""
+        """Reason why a file is not part of the study, or ""."""
         made_from = data.attrs.get("made_from", "").split()
         if self.keys is not None and not self.keys.issuperset(made_from):
-            return "belongs to an earlier run and is left out; run the analysis again"
+            return "belongs to an earlier run and is skipped; run the analysis again"
         return ""
 
 
 def open_study(folder: Path | str) -> xr.DataTree:
     """Open a study folder, finished or not.
 
-    Variables are read when they are used, of ``/registration`` those of the shapes that are asked
-    for; no file is held open.  The stages that are there are in the tree, those
-    that are not yet computed are absent, as are files that were made from others than those now in
-    the folder (that is said in a warning of the log).
+    Variables are read when they are used, those of ``/registration`` for the selected shapes only;
+    no file is kept open.  Stages that are not yet computed are absent.  Files that do not match the
+    others in the folder are skipped with a warning.
 
-    Every file is checked: its bytes by their checksums, see :mod:`s4a.study.netcdf`, its variables
-    by what a file of its name holds, see :mod:`s4a.study.contents`.  Nothing leads out of the
-    folder: links in it, and what HDF5 would take from other files, are refused.
+    Every file is verified by its checksums (:mod:`s4a.study.netcdf`) and against the schema
+    (:mod:`s4a.study.contents`).  Links in the folder, and references of HDF5 to other files, are
+    refused.
 
     Parameters
     ----------
     folder : path
-        As given to ``store=`` or ``s4a run --out``.
+        Folder given to ``store=`` or ``s4a run --out``.
 
     Returns
     -------
@@ -187,15 +185,18 @@ def open_study(folder: Path | str) -> xr.DataTree:
     Raises
     ------
     ValueError
-        When the folder is not a study.
+        If the folder is not a study.
     DamagedError
-        An OSError, when a file is not what a run wrote; it is named, with what mends it.  So is one
-        of a larger variable that is read later.
+        If a file is damaged (an OSError); the message has the file and the remedy.  Larger
+        variables are checked when they are read.
+
+    See Also
+    --------
+    analyse : compute a study.
+    verify : check all files of a study.
 
     Examples
     --------
-    With ``store``, the folder of six small brains:
-
     >>> import tempfile
     >>> import s4a
     >>> store = tempfile.mkdtemp()
@@ -216,9 +217,9 @@ def open_study(folder: Path | str) -> xr.DataTree:
     )
     template = reader.read(["registration"], read)
     if template and "latent" in nodes:
-        apart = excluded_of(template["registration"])
-        nodes |= reader.read(f"latent/{name}" for name in apart)
-        names = sorted([*nodes["latent"]["shape"].values.tolist(), *apart])
+        excluded = excluded_of(template["registration"])
+        nodes |= reader.read(f"latent/{name}" for name in excluded)
+        names = sorted([*nodes["latent"]["shape"].values.tolist(), *excluded])
         files = reader.read(f"registration/{name}" for name in names)
         files = {path.removeprefix("registration/"): data for path, data in files.items()}
         if files:
@@ -232,12 +233,12 @@ def open_study(folder: Path | str) -> xr.DataTree:
 
 
 def excluded_of(registration: xr.Dataset) -> list[str]:
-    """The shapes that are registered and stand apart from the network, as they are flagged."""
+    """Return the flagged shapes that are registered, but excluded from the network."""
     return str(registration.attrs.get("excluded", "")).split()
 
 
 def seconds_of(report: xr.Dataset) -> str:
-    """Seconds of all stages together, in the words of the command line and of the page.
+    """Format the total time of all stages, for the command line and the page.
 
     Examples
     --------
@@ -250,9 +251,9 @@ def seconds_of(report: xr.Dataset) -> str:
 
 
 def left_out(study: xr.DataTree) -> list[str]:
-    """The flagged shapes of a study, which modes and statistics are made without.
+    """Return the flagged shapes of a study, which are excluded from modes and statistics.
 
-    None where ``include_flagged`` was given; a template that was named is trusted.
+    The list is empty with ``include_flagged``, and never has the template.
     """
     if "report" not in study.children or "registration" not in study.children:
         return []
@@ -265,7 +266,7 @@ def left_out(study: xr.DataTree) -> list[str]:
 
 
 def reported(folder: Path) -> set[str] | None:
-    """The shapes of the last run; None where it has no report."""
+    """Return the shapes of the last run; None if there is no report."""
     path = folder / "report.nc"
     if not path.exists():
         return None
@@ -276,7 +277,7 @@ def reported(folder: Path) -> set[str] | None:
 
 
 def as_reported(nodes: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
-    """The nodes of the shapes that the last run used, with the paths that it read them from."""
+    """Select the nodes of the shapes of the last run, with the paths of their files."""
     report = nodes["report"]
     used = report.sel(shape=report["status"].values != "excluded")
     paths = dict(zip(used["shape"].values.tolist(), used["path"].values.tolist(), strict=True))
@@ -285,32 +286,31 @@ def as_reported(nodes: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
         stage, _, name = node.rpartition("/")
         if stage in ("original", "coarse", "registration") and name not in paths:
             continue
-        if stage == "original" and paths[name]:  # the file may have moved since it was read
+        if stage == "original" and paths[name]:  # the file may have moved
             data = data.assign_attrs(path=paths[name])
         reported[node] = data
     return reported
 
 
 def write_inserted(inserted: xr.DataTree, folder: Path | str) -> Path:
-    """Write what :func:`s4a.insert` gives, for :func:`open_inserted`; its file in the folder."""
+    """Write the result of :func:`s4a.insert` for :func:`open_inserted`; return the file."""
     path = Path(folder) / "inserted.nc"
     write(inserted, path)
     return path
 
 
 def open_inserted(file: Path | str) -> xr.DataTree:
-    """What ``s4a insert`` wrote: its folder, or ``inserted.nc`` in it.
+    """Open the result of ``s4a insert``, given its folder or ``inserted.nc`` in it.
 
     Raises
     ------
     ValueError
-        When there is none.
+        If there is no such file.
     """
     path = Path(file)
     path = path / "inserted.nc" if path.is_dir() else path
     if not path.exists():
         raise ValueError(
-            f"{path}: there is no such file; s4a insert STUDY SHAPES --out DIR writes "
-            "DIR/inserted.nc"
+            f"{path} does not exist; s4a insert STUDY SHAPES --out DIR writes DIR/inserted.nc"
         )
     return read_tree(path)

@@ -1,4 +1,4 @@
-"""What holds of a study (4): each of its files read whole, and whether all belong together."""
+"""Verify a study (4): checksums and provenance of every file."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,28 +20,32 @@ OWN = {*STAGES, ".lock", "study.html", "report.txt", "modes.png", "statistics"}
 
 
 def verify(folder: Path | str) -> xr.Dataset:
-    """Read every byte of a study, and say which of its files hold.
+    """Verify checksums and provenance of every file of a study.
 
     Parameters
     ----------
     folder : path
-        Of a study, see :func:`s4a.open_study`.  Nothing in it is changed.
+        Folder of a study, see :func:`s4a.open_study`; it is not changed.
 
     Returns
     -------
     Dataset
-        ``state(file)`` and ``fault(file)``, what is wrong in words, of every file that is in the
-        folder or should be.  States are
+        ``state(file)`` and ``fault(file)``, a text, of every file that is in the folder or should
+        be.  States are
 
-        - ``whole``: as it was written, with all that it needs, made from files of the study;
-        - ``damaged``, ``missing``, or ``stale``: made from files that are no longer there, which is
-          looked for where none is damaged;
-        - ``left over`` from an earlier run, or ``foreign``: no part of the study.
+        - ``whole``: undamaged, complete, and made from files of the study;
+        - ``damaged``, ``missing``, or ``stale``: made from files that no longer exist, checked only
+          if no file is damaged;
+        - ``left over`` from an earlier run, or ``foreign``: not part of the study.
 
     Raises
     ------
     ValueError
-        When the folder is not a study.
+        If the folder is not a study.
+
+    See Also
+    --------
+    open_study : open a study.
 
     Examples
     --------
@@ -57,38 +61,38 @@ def verify(folder: Path | str) -> xr.Dataset:
     folder = Path(folder)
     check_is_study(folder)
     reader = Reader(folder)
-    looks = {}
+    states_and_faults = {}
     for name in names_in_order(folder):
-        looks[name] = look(reader, name)
-        if looks[name][0] == "damaged":
-            reader.keys = None  # what was made from it may be right
+        states_and_faults[name] = check_file(reader, name)
+        if states_and_faults[name][0] == "damaged":
+            reader.keys = None  # files made from it may be undamaged
     if "report" in reader.files:
         needed = needed_files(reader.files["report"], reader.files.get("registration"))
-        for name in looks:
+        for name in states_and_faults:
             if name not in needed and name.startswith((*OF_SHAPE, "latent/")):
-                looks[name] = "left over", "not of the last run"
+                states_and_faults[name] = "left over", "not of the last run"
     else:
         needed = ["report"]
     for name in needed:
-        looks.setdefault(name, ("missing", "no run has made it, or it was removed"))
-    rows = {f"{name}.nc": found for name, found in looks.items()}
+        states_and_faults.setdefault(name, ("missing", "not computed yet, or removed"))
+    rows = {f"{name}.nc": row for name, row in states_and_faults.items()}
     rows |= dict.fromkeys(foreign(folder), ("foreign", "not made by s4a"))
     states, faults = zip(*rows.values(), strict=True)
     return dataset(state=list(states), fault=list(faults)).assign_coords(file=list(rows))
 
 
 def names_in_order(folder: Path) -> list[str]:
-    """The files of the study that are there, those before that others are made from."""
-    places = [p for p in (folder, *(folder / stage for stage in STAGES)) if p.is_dir()]
-    paths = [path for place in places for path in place.glob("[!.]*.nc")]
+    """Names of the files of a study, in the order of their dependencies."""
+    folders = [p for p in (folder, *(folder / stage for stage in STAGES)) if p.is_dir()]
+    paths = [path for parent in folders for path in parent.glob("[!.]*.nc")]
     names = [path.relative_to(folder).with_suffix("").as_posix() for path in paths]
     order = list(HOLDS)
-    known = [(order.index(kind_of(name)), name) for name in names if kind_of(name) in HOLDS]
-    return [name for _, name in sorted(known)]
+    ranked = [(order.index(kind_of(name)), name) for name in names if kind_of(name) in HOLDS]
+    return [name for _, name in sorted(ranked)]
 
 
-def look(reader: Reader, name: str) -> tuple[str, str]:
-    """State and fault of a file, of which every byte is read."""
+def check_file(reader: Reader, name: str) -> tuple[str, str]:
+    """Read every byte of a file; return state and fault."""
     path = reader.path(name)
     try:
         data, fault = reader.open(name, open_file)
@@ -100,27 +104,28 @@ def look(reader: Reader, name: str) -> tuple[str, str]:
 
 
 def check_netcdf(path: Path, data: xr.Dataset) -> None:
-    """OSError where other programs find something else in a file than its contents say."""
-    data = data.load()  # as it is read, it is checked
+    """Raise OSError if netCDF programs would read other data than the table of contents has."""
+    data = data.load()  # reading verifies the checksums
     with open_hdf5(path) as file:
         names = {name.decode() for name in file} - {GROUP}
     if names != {*data.variables, *data.sizes}:
-        raise OSError(f"it has other variables than its contents: {names ^ set(data.variables)}")
-    with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as there:
-        if not there.identical(data):
-            raise OSError("its contents are not those of its HDF5")
+        raise OSError(f"variables and contents differ: {names ^ set(data.variables)}")
+    with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored:
+        if not stored.identical(data):
+            raise OSError("the contents differ from the HDF5 data")
 
 
 def needed_files(report: xr.Dataset, registration: xr.Dataset | None) -> list[str]:
-    """The files that a finished run with this report has made."""
+    """Names of the files of a finished run with this report."""
     names = report["shape"].values[report["status"].values != "excluded"].tolist()
     of_shapes = [f"{prefix}{name}" for prefix in OF_SHAPE for name in names]
-    apart = [] if registration is None else [f"latent/{name}" for name in excluded_of(registration)]
-    return [*of_shapes, *apart, *OF_ALL, *([] if report.attrs["no_modes"] else ["pca"])]
+    excluded = [] if registration is None else excluded_of(registration)
+    latent = [f"latent/{name}" for name in excluded]
+    return [*of_shapes, *latent, *OF_ALL, *([] if report.attrs["no_modes"] else ["pca"])]
 
 
 def foreign(folder: Path) -> Iterator[str]:
-    """What else lies in the folder of a study and in those of its stages, but for hidden files."""
+    """Yield other files in the folder of a study and its stages, except hidden ones."""
     known = {*OWN, *(f"{name}.nc" for name in names_in_order(folder))}
     for pattern in ("[!.]*", *(f"{stage}/[!.]*" for stage in STAGES)):
         for path in sorted(folder.glob(pattern)):

@@ -38,7 +38,7 @@ POSITIONS = (
 SHOW = "a shape, or a map between two shapes"
 NARROW = {"width": "20em"}
 MOST = 100  # nodes of a graph
-UNKNOWN = "unknown (in no cycle)"
+UNKNOWN = "unknown: in no cycle"
 ERRORS = "cycle error (logarithmic)"
 
 

@@ -1,4 +1,4 @@
-"""Registered output and training sets: what is written is what the study holds."""
+"""Registered output and training sets: files equal the arrays of the study."""
 
 import csv
 import json
@@ -46,8 +46,8 @@ def test_in_the_frame_of_the_shape_the_registered_surface_lies_on_it(study, mesh
     matched = study["registration"]["registered_match"]
     for name, mesh in meshes.items():
         points, _, _ = read_mesh(tmp_path / f"{name}.ply")
-        gap = points - mesh["position"].values[matched.sel(shape=name).values]
-        assert np.linalg.norm(gap, axis=1).mean() < 8  # mm, few modes on few vertices
+        distance = points - mesh["position"].values[matched.sel(shape=name).values]
+        assert np.linalg.norm(distance, axis=1).mean() < 8  # mm, few modes on few vertices
 
 
 def test_a_training_set_has_meshes_labels_landmarks_and_a_split(study, meshes, tmp_path):

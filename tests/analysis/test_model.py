@@ -1,4 +1,4 @@
-"""Components of all shapes but one, from those of all, beside those computed again."""
+"""Components of all shapes but one, from those of all, compared with a direct computation."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from s4a.analysis.model import describe_by_others, downdate, leave_one_out
 
 
-def computed_anew(K):
+def computed_again(K):
     """Error and score of every field by the model of the others, decomposed for each."""
     described = []
     for i in range(len(K)):
@@ -48,11 +48,11 @@ KINDS = (
 
 @pytest.mark.parametrize("s", [4, 7, 40])
 @pytest.mark.parametrize("kind", KINDS)
-def test_left_out_fields_are_described_as_by_components_computed_anew(kind, s):
+def test_left_out_fields_are_described_as_by_components_computed_again(kind, s):
     x = fields(kind, s, np.random.default_rng(s))
     K = x @ x.T
     error, score = leave_one_out(K)
-    expected = computed_anew(K)
+    expected = computed_again(K)
     # the square of an error that is 0 is rounded, to 1e-15 of the largest
     assert error**2 == pytest.approx(expected[0] ** 2, abs=1e-12 * K.max())
     assert score == pytest.approx(expected[1], rel=1e-6, abs=1e-6, nan_ok=True)

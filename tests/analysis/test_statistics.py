@@ -1,6 +1,6 @@
 """Statistics (6.1): closed forms of a one-mode family, simulated groups.
 
-And p values under no difference.
+And p values under the null hypothesis.
 """
 
 import numpy as np
@@ -184,9 +184,9 @@ def test_specificity_is_the_distance_between_the_fields():
     assert distance.shape == (len(variance), 7) == (4, 7)
     for c in range(4):
         drawn = d.mean(0) + np.einsum("pc,cnx->pnx", score[:, : c + 1], modes[: c + 1])
-        gap = np.sqrt((w * (drawn[:, None] - d) ** 2).sum((2, 3)))
-        assert distance[c] == pytest.approx(gap.min(1))
-        assert (nearest[c] == gap.argmin(1)).all()
+        distances = np.sqrt((w * (drawn[:, None] - d) ** 2).sum((2, 3)))
+        assert distance[c] == pytest.approx(distances.min(1))
+        assert (nearest[c] == distances.argmin(1)).all()
 
 
 def test_only_components_above_chance_explain_more_than_permuted_coefficients():
@@ -227,14 +227,14 @@ def test_samples_have_the_drawn_scores(simulated):
     )
     moved = np.tensordot(drawn["score"].values[0], simulated[0]["pca"]["deformation"].values[:3], 1)
     assert drawn["sample_1"]["position"].values == pytest.approx(template + moved, abs=1e-6)
-    with pytest.raises(ValueError, match="a number from 1 to 29, found 30"):
+    with pytest.raises(ValueError, match="a number from 1 to 29; found 30"):
         statistics.sample(simulated[0], 2, n_components=30)
 
 
 # groups and variables
 
 
-def test_planted_groups_are_found_and_the_map_marks_the_patch(simulated):
+def test_simulated_groups_are_found_and_the_map_marks_the_patch(simulated):
     study, group, patch, _ = simulated
     whole = statistics.group_test(study, "group", covariates={"age": "age"}, n_permutations=999)
     assert whole["p_value"].item() == whole.attrs["smallest_p"] == 0.001
@@ -266,9 +266,9 @@ def test_a_continuous_variable_is_found_with_its_slope_and_its_shapes_move(simul
     assert found["p_value"].item() == 0.001
     u = study["registration"]["position"].values
     slope = found["effect"].values
-    planted_slope = 0.3 / 60 * u * [1, 0, 0]
-    assert (
-        np.vdot(slope, planted_slope) / np.linalg.norm(slope) / np.linalg.norm(planted_slope) > 0.8
+    simulated_slope = 0.3 / 60 * u * [1, 0, 0]
+    assert np.vdot(slope, simulated_slope) > 0.8 * np.linalg.norm(slope) * np.linalg.norm(
+        simulated_slope
     )
     old, young = (statistics.predict(study, found, a)["position"].values for a in (80, 20))
     assert np.ptp(old[:, 0]) > np.ptp(young[:, 0]) + 0.3
@@ -322,9 +322,9 @@ def test_the_statistics_are_those_of_the_textbook():
     for v in range(5):
         a, b = d[:6, v], d[6:, v]
         S = (np.cov(a.T, bias=True) * 6 + np.cov(b.T, bias=True) * 8) / 12
-        gap = b.mean(0) - a.mean(0)
+        difference = b.mean(0) - a.mean(0)
         assert 12 * share[v] / (1 - share[v]) == pytest.approx(
-            6 * 8 / 14 * gap @ np.linalg.solve(S, gap), rel=1e-4
+            6 * 8 / 14 * difference @ np.linalg.solve(S, difference), rel=1e-4
         )
     one, _, _ = Model(x, n_permutations=0).vertex_test(d[..., :1])
     t = stats.ttest_ind(d[:6, :, 0], d[6:, :, 0]).statistic
@@ -335,7 +335,7 @@ def test_the_statistics_are_those_of_the_textbook():
     assert 11 / 2 * share / (1 - share) == pytest.approx(F, rel=1e-4)
 
 
-def test_small_groups_are_refused_or_warned_of_and_the_smallest_p_is_told(caplog):
+def test_small_groups_are_refused_or_warned_about_and_the_smallest_p_is_reported(caplog):
     rng = np.random.default_rng(0)
     u, T = as_arrays(synthetic.sphere(200))
     study = study_of(u, T, smooth_noise(rng, u, 7))
@@ -353,7 +353,7 @@ def test_small_groups_are_refused_or_warned_of_and_the_smallest_p_is_told(caplog
         statistics.regression(study, np.arange(7), covariates=2 * np.arange(7) + 1)
     with pytest.raises(ValueError, match="'age' needs a column of that name in /subjects"):
         statistics.regression(study, "age")
-    with pytest.raises(ValueError, match="at least 4 shapes, found 3"):
+    with pytest.raises(ValueError, match="at least 4 shapes; found 3"):
         statistics.outliers(study_of(u, T, smooth_noise(rng, u, 3)))
 
 
@@ -369,10 +369,10 @@ def twelve():
     [
         (np.full(12, 0.1), "the tested variable is constant"),
         (1e9 + 1e-7 * np.arange(12), "the tested variable is constant"),
-        (1e-300 * np.arange(1, 13), "of a size between 1e-30 and 1e30, found 1.2e-299"),
+        (1e-300 * np.arange(1, 13), "between 1e-30 and 1e30; found 1.2e-299"),
         ([np.inf] + [1.0] * 11, "variable needs finite numbers; found infinite ones for shape_00"),
         ([np.nan] * 12, "at least 4 shapes with all values; found 0 of 12"),
-        (np.array(["2020-01-01"] * 12, "M8[D]"), "found dates; a date can be given as a number"),
+        (np.array(["2020-01-01"] * 12, "M8[D]"), "found dates: give a date as a number"),
         (np.arange(12) * 1j, "found complex numbers"),
         (np.zeros((12, 2)), "one number for each shape"),
         (["31", "?", *map(str, range(10))], "1 of 12 cells are not .shape_01: '\\?'"),
@@ -398,10 +398,10 @@ def test_neither_unit_nor_origin_of_a_variable_changes_its_test(twelve):
     "covariate, words",
     [
         (["31,5", *(f"4{i},1" for i in range(11))], "a decimal point and without unit, and NA"),
-        ([f"s{i}" for i in range(12)], "it names shapes, not groups of them"),
+        ([f"s{i}" for i in range(12)], "it names shapes, not groups"),
         ([f"2020-01-0{1 + i % 3}" for i in range(12)], "has dates, such as 2020-01-01"),
         ([0, 1] * 6, "the tested variable is a combination of the covariates"),
-        (np.random.default_rng(0).normal(size=(12, 11)), "11 of the covariates.*14 shapes needed"),
+        (np.random.default_rng(0).normal(size=(12, 11)), "11 covariates.*use 14 shapes"),
     ],
 )
 def test_a_covariate_of_no_use_is_refused_with_what_to_do(covariate, words, twelve):
@@ -409,7 +409,7 @@ def test_a_covariate_of_no_use_is_refused_with_what_to_do(covariate, words, twel
         statistics.group_test(*twelve, covariates={"it": covariate}, n_permutations=9)
 
 
-def test_what_becomes_of_the_covariates_is_told(twelve, caplog):
+def test_the_handling_of_covariates_is_reported(twelve, caplog):
     study, group = twelve
     size = np.arange(12) ** 2
     given = {"sex": [0, 0, 1, 1] * 3, "site": list("xxyyzz") * 2, "size": size}
@@ -425,7 +425,7 @@ def test_what_becomes_of_the_covariates_is_told(twelve, caplog):
     )
 
 
-def test_a_covariate_that_numbers_the_shapes_is_told(twelve, caplog):
+def test_a_covariate_that_numbers_the_shapes_is_reported(twelve, caplog):
     study, group = twelve
     rng = np.random.default_rng(0)
     given = {
@@ -437,15 +437,15 @@ def test_a_covariate_that_numbers_the_shapes_is_told(twelve, caplog):
     }
     statistics.group_test(study, group, covariates=given, n_permutations=9)
     words = " has a different integer"
-    told = [line.partition(words)[0] for line in caplog.messages if words in line]
-    assert told == ["covariate 'order'", "covariate 'Subject_ID'"]
-    assert "for each shape, 1000 to 1077: leave it out if it numbers the shapes" in caplog.text
+    columns = [line.partition(words)[0] for line in caplog.messages if words in line]
+    assert columns == ["covariate 'order'", "covariate 'Subject_ID'"]
+    assert "for each shape, 1000 to 1077: omit it if it only numbers the shapes" in caplog.text
 
 
-@pytest.mark.parametrize("gap", ["NA", "n/a", "-", "", "nan", None, float("nan")])
-def test_a_missing_text_is_no_group(gap, twelve, caplog):
+@pytest.mark.parametrize("missing", ["NA", "n/a", "-", "", "nan", None, float("nan")])
+def test_a_missing_text_is_no_group(missing, twelve, caplog):
     study, group = twelve
-    found = statistics.group_test(study, [gap, *group[1:11], gap], n_permutations=9)
+    found = statistics.group_test(study, [missing, *group[1:11], missing], n_permutations=9)
     assert found.attrs["groups"] == "a: 5, b: 5"
     assert found.attrs["left_out"] == "shape_00, shape_11"
     assert "no value for 2 of 12 shapes" in caplog.text
@@ -478,7 +478,7 @@ def test_a_test_that_can_find_nothing_says_so(twelve, caplog):
 @pytest.mark.parametrize("n", [-1, 0, 10**22])
 def test_a_number_of_permutations_that_makes_no_test_is_refused(n, twelve):
     for test in (statistics.group_test, statistics.group_map, statistics.classify):
-        with pytest.raises(ValueError, match=f"a number from 1 to 10000000, found {n}"):
+        with pytest.raises(ValueError, match=f"a number from 1 to 10000000; found {n}"):
             test(*twelve, n_permutations=n)
 
 
@@ -498,7 +498,7 @@ def test_statistics_of_shapes_that_are_equal_or_not_finite_say_so(twelve):
             statistics.group_map(other, twelve[1])
 
 
-def test_groups_of_unequal_scatter_are_told_and_signs_hold_the_level(caplog):
+def test_groups_of_unequal_variance_are_reported_and_sign_flips_hold_the_level(caplog):
     x = np.repeat([0.0, 1.0], [15, 5])
     found = {"equal": [], "unequal": []}
     for seed in range(60):
@@ -522,7 +522,7 @@ def test_groups_of_unequal_scatter_are_told_and_signs_hold_the_level(caplog):
 # outliers and classes
 
 
-def test_a_strange_shape_and_a_far_one_are_outliers_and_the_others_are_not():
+def test_an_unusual_shape_and_an_extreme_one_are_outliers_and_the_others_are_not():
     rng = np.random.default_rng(7)
     u, T = as_arrays(synthetic.sphere(400))
     modes = smooth_noise(rng, u, 2)
@@ -556,7 +556,7 @@ def test_distances_of_a_normal_population_have_uniform_p_values():
     assert np.mean(p < 0.05) < 0.1
 
 
-def test_planted_groups_are_classified_and_shuffled_ones_are_not(simulated):
+def test_simulated_groups_are_classified_and_shuffled_ones_are_not(simulated):
     study, group, _, _ = simulated
     found = statistics.classify(study, group, n_permutations=19)
     assert found.attrs["balanced_accuracy"] > 0.85

@@ -1,4 +1,4 @@
-"""Transfer (6.2): labels, landmarks and fields on known correspondences, the files, the command.
+"""Transfer (6.2): labels, landmarks and fields with known correspondences, files, command.
 
 Real templates.
 """
@@ -62,14 +62,14 @@ def size(meshes):
 
 @pytest.fixture(scope="module")
 def study(meshes):
-    """The first brain registered to the two others, one pair after the other, both ways."""
+    """The first brain registered to the two others, in both directions."""
     others = {name: mesh for name, mesh in meshes.items() if name != "brain_01"}
     return register_pairs(meshes["brain_01"], others, name="brain_01", **OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def moved(meshes):
-    """The first brain with its vertices in another order, turned and shifted; and the order."""
+    """The first brain with its vertices in another order, rotated and shifted; and the order."""
     X, T = as_arrays(meshes["brain_01"])
     order = np.random.default_rng(0).permutation(len(X))
     R = Rotation.from_euler("zyx", [20, 10, -15], degrees=True).as_matrix()
@@ -90,11 +90,11 @@ def test_labels_and_landmarks_of_a_moved_and_renumbered_copy_are_exact(meshes, m
     assert found["label_share"].values == pytest.approx(1, abs=1e-4)
     assert found["confidence"].values == pytest.approx(1, abs=1e-3)
     landmarks = mesh[["landmark_name", "landmark_position"]]
-    place = transfer_landmarks(study, landmarks)["source"]
+    marks = transfer_landmarks(study, landmarks)["source"]
     exact = locate(landmarks, mesh)["landmark_position"].values @ R.T + [30, -20, 5]
-    assert distance(place["landmark_position"].values, exact).max() < 1e-4 * size
-    assert place["landmark_name"].values.tolist() == list(synthetic.LANDMARKS)
-    back = transfer_landmarks(study, place, source="source")["target"]
+    assert distance(marks["landmark_position"].values, exact).max() < 1e-4 * size
+    assert marks["landmark_name"].values.tolist() == list(synthetic.LANDMARKS)
+    back = transfer_landmarks(study, marks, source="source")["target"]
     assert (
         distance(
             back["landmark_position"].values, locate(landmarks, mesh)["landmark_position"]
@@ -121,7 +121,7 @@ def test_labels_of_deformed_brains_are_nearly_right_and_better_than_by_the_neare
         assert 0 < node["confidence"].values.min() <= node["confidence"].values.max() <= 1
 
 
-def test_landmarks_lie_inside_triangles_of_the_shape_and_near_the_truth(study, meshes, size):
+def test_landmarks_are_inside_triangles_of_the_shape_and_accurate(study, meshes, size):
     landmarks = meshes["brain_01"][["landmark_name", "landmark_position"]]
     for name, node in transfer_landmarks(study, landmarks).children.items():
         X, T = as_arrays(meshes[name])
@@ -169,7 +169,7 @@ def test_fields_are_interpolated_and_unknown_values_stay_unknown(study, meshes, 
     assert np.abs(some - found)[known].mean() < 0.005 * size
 
 
-def test_matching_both_ways_is_symmetric_and_one_way_is_possible(study, meshes):
+def test_bidirectional_matching_is_symmetric_and_can_be_disabled(study, meshes):
     one = register_pairs(
         meshes["brain_01"], {"a": meshes["brain_02"]}, bidirectional=False, **OPTIONS
     )
@@ -188,7 +188,7 @@ def test_the_label_with_most_votes_wins_and_ties_go_to_the_first():
     assert vote[1] == pytest.approx([0.7, 0.3])
 
 
-def test_votes_spread_as_far_as_the_blur_says_and_keep_their_sum():
+def test_votes_diffuse_as_far_as_the_blur_and_keep_their_sum():
     X, T = as_arrays(synthetic.sphere(4000))
     area = vertex_areas(X, T)
     one = np.zeros((len(X), 2), np.float32)
@@ -215,7 +215,7 @@ def test_sure_votes_stay_where_they_fall():
     assert vote[sure] == pytest.approx(sides[sure], abs=1e-4)
 
 
-def test_blurred_votes_are_nearer_to_the_truth_and_no_label_is_lost(study, meshes):
+def test_diffused_votes_are_more_accurate_and_no_label_is_lost(study, meshes):
     label = meshes["brain_01"]["label"].values.copy()
     sharp, blurred = (transfer_labels(study, label, blur=blur) for blur in (0, 1))
     for name in sharp.children:
@@ -262,7 +262,7 @@ def test_wrong_sources_targets_and_lengths_are_refused(study, meshes):
         transfer_landmarks(study, far)
 
 
-def test_curves_are_carried_as_polylines_between_the_vertices(study, meshes, tree, size):
+def test_curves_are_transferred_as_polylines_between_the_vertices(study, meshes, tree, size):
     angle = np.linspace(0, 2 * np.pi, 41)[:-1]
     ring = np.stack([np.cos(angle), 0.3 + 0 * angle, np.sin(angle)], axis=1) / np.sqrt(1.09)
     given = dataset(
@@ -342,7 +342,7 @@ def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
             4,
             r"one array of 4 values needed, found p \(4,\), q \(4,\); name it as two.npz:NAME",
         ),
-        ("two.npz:r", 4, "no array 'r'; it has p, q"),
+        ("two.npz:r", 4, "array .r. needed, found p, q"),
         ("a.csv", 1, "a column 'label' needed, found p, q"),
         ("none.npy", 1, "no file .*none.npy"),
     ):
@@ -386,14 +386,14 @@ def test_every_landmark_file_gives_the_same_points(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("name,x,y,z\n# picked by hand\na,1,2,3\n\nb,1,2\n", "line 5 needs 4 cells .* found 3"),
-        ("name,x,y,z\na,1,2,3\nb,1,5,2,5,3,5\n", "line 3 needs 4 cells .* found 7: 'b, 1, 5"),
-        ("a 1 2 3\nb 4\n", "line 2 needs 4 cells .* found 2"),
+        ("name,x,y,z\n# picked by hand\na,1,2,3\n\nb,1,2\n", "line 5 needs 4 cells.* found 3"),
+        ("name,x,y,z\na,1,2,3\nb,1,5,2,5,3,5\n", "line 3 needs 4 cells.* found 7: 'b, 1, 5"),
+        ("a 1 2 3\nb 4\n", "line 2 needs 4 cells.* found 2"),
         ("name;x;y;z\na;1,5;2;3\n", "line 2 needs a number, found '1,5'"),
-        ("name,x,y,z,curve,closed\na,1,2,3\n", "line 2 needs 6 cells .* found 4"),
+        ("name,x,y,z,curve,closed\na,1,2,3\n", "line 2 needs 6 cells.* found 4"),
     ],
 )
-def test_a_row_of_landmarks_that_is_none_is_named_with_its_line(tmp_path, text, said):
+def test_an_invalid_row_of_landmarks_is_named_with_its_line(tmp_path, text, said):
     (tmp_path / "points.csv").write_text(text)
     with pytest.raises(ValueError, match=rf"points\.csv cannot be read as landmarks: {said}"):
         read_landmarks(tmp_path / "points.csv")
@@ -408,11 +408,11 @@ def test_empty_cells_behind_a_row_and_comments_change_no_landmark(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("vertex,label\n0,a\n1\n", "line 3 needs 2 cells .* found 1"),
+        ("vertex,label\n0,a\n1\n", "line 3 needs 2 cells.* found 1"),
         ("vertex,label\n0,a\nb,a\n", "line 3 needs a number, found 'b'"),
     ],
 )
-def test_a_row_of_labels_that_is_none_is_named_with_its_line(tmp_path, text, said):
+def test_an_invalid_row_of_labels_is_named_with_its_line(tmp_path, text, said):
     (tmp_path / "labels.csv").write_text(text)
     with pytest.raises(ValueError, match=rf"labels\.csv cannot be read as labels: {said}"):
         read_labels(tmp_path / "labels.csv")
@@ -444,7 +444,7 @@ def test_curves_of_slicer_and_of_tables_come_out_of_their_files_in_order(tmp_pat
         read_landmarks(tmp_path / "one.csv")
 
 
-def test_lps_landmarks_find_their_place_on_a_ras_mesh(meshes):
+def test_lps_landmarks_are_located_on_a_ras_mesh(meshes):
     mesh = meshes["brain_01"]
     assert mesh.attrs["coordinate_system"] == "RAS"
     X = mesh["position"].values[:40]
@@ -464,7 +464,7 @@ def test_lps_landmarks_find_their_place_on_a_ras_mesh(meshes):
         locate(mirrored.assign_attrs(coordinate_system="RAS"), mesh, farthest=0.001)
 
 
-def test_landmarks_off_the_surface_are_brought_onto_it_and_the_distance_is_told():
+def test_landmarks_off_the_surface_are_projected_onto_it_and_the_distance_is_reported():
     mesh = synthetic.sphere(2000)
     given = dataset(landmark_name=np.array(["a"]), landmark_position=np.array([[0, 0, 1.05]]))
     found = locate(given, mesh)
@@ -473,7 +473,7 @@ def test_landmarks_off_the_surface_are_brought_onto_it_and_the_distance_is_told(
 
 
 @pytest.mark.parametrize("x", [np.nan, np.inf, 1e300, 1e160])
-def test_a_landmark_at_no_place_is_named(x):
+def test_a_landmark_without_a_position_is_named(x):
     given = dataset(landmark_name=["a", "b"], landmark_position=[[0, 0, 1], [0, x, 0]])
     with pytest.raises(ValueError, match="finite positions near the surface; 'b' is at"):
         locate(given, synthetic.sphere(100))
@@ -522,9 +522,9 @@ def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path
     assert 0 < sure.min() <= sure.max() <= 1
     rows = (tmp_path / "out" / "target one.landmarks.csv").read_text().splitlines()
     assert rows[0] == "name,x,y,z"
-    place = read_landmarks(tmp_path / "out" / "target one.landmarks.csv")
+    marks = read_landmarks(tmp_path / "out" / "target one.landmarks.csv")
     assert (
-        distance(place["landmark_position"].values, target["landmark_position"].values).mean() < 4
+        distance(marks["landmark_position"].values, target["landmark_position"].values).mean() < 4
     )
     assert cli.main(["transfer", "a.ply", "b.ply", "--out", str(tmp_path)]) == 2
     assert "--labels FILE" in capsys.readouterr().err

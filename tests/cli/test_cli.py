@@ -60,7 +60,7 @@ def test_run_writes_a_line_for_each_stage_where_there_is_no_terminal(ran):
     _, result = ran
     lines = [line for line in result.stderr.splitlines() if line.startswith("INFO: ")]
     assert [line.split(": ")[1] for line in lines] == list(STAGES)
-    assert re.fullmatch(r"INFO: registration: 4 of 4 were to do, [\d.]+ s, \d+ MiB", lines[-2])
+    assert re.fullmatch(r"INFO: registration: 4 of 4 tasks computed, [\d.]+ s, \d+ MiB", lines[-2])
     assert "it/s" not in result.stderr
 
 
@@ -259,7 +259,7 @@ def test_flags_and_their_help_follow_from_a_function():
     assert "how often (default: 2)" in said
 
 
-def test_demo_finds_the_planted_modes_and_writes_its_page(tmp_path, monkeypatch, capsys):
+def test_demo_finds_the_simulated_modes_and_writes_its_page(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("s4a.write_page", lambda tree, file, **_: file.write_text("page"))
     out = tmp_path / "demo"
     assert (

@@ -82,14 +82,14 @@ def test_the_population_does_not_depend_on_resolution():
 
 
 @pytest.mark.parametrize("n", [6, 12, 51])
-def test_planted_scores_are_standardised_bounded_and_uncorrelated(n):
+def test_simulated_scores_are_standardised_bounded_and_uncorrelated(n):
     score = synthetic.simulate(n, seed=2)["true_score"].values
     assert np.allclose(score.T @ score / n, np.eye(3), atol=1e-12)
     assert np.allclose(score.mean(0), 0, atol=1e-12)
     assert np.abs(score).max() <= 2.5
 
 
-def test_planted_modes_are_orthogonal_free_of_rigid_motion_and_fall_by_the_ratio():
+def test_simulated_modes_are_orthogonal_free_of_rigid_motion_and_fall_by_the_ratio():
     u, T = synthetic._sphere(6000)
     x = synthetic.reference_brain(u)
     area = mesh.vertex_areas(x, T)

@@ -71,7 +71,7 @@ def test_maps_of_low_resolution_take_less_time_than_those_of_dense_meshes(found)
     assert (seconds.sel(algorithm=["SCALABLE", "RE-MATCH"]) < dense).all()
 
 
-def test_the_default_is_nearer_to_the_truth_than_every_other_method(found):
+def test_the_default_is_more_accurate_than_every_other_method(found):
     error = found["euclidean_error"].mean("pair")
     others = error.drop_sel(algorithm=["registered", "registered surface"])
     assert error.sel(algorithm="registered") < 0.9 * others.min()

@@ -106,7 +106,7 @@ def test_names_and_columns_choose(reflect, chosen):
         ("side", "needs a column of 1 and 0, or a value, side=l"),
     ],
 )
-def test_what_cannot_be_mirrored_is_an_error_that_says_why(reflect, words):
+def test_an_invalid_choice_to_mirror_is_an_error_that_says_why(reflect, words):
     columns = {"side": ["l", "l", "r"], "gap": ["l", "", "r"], "none": [0, 0, 0]}
     with pytest.raises(ValueError, match=words):
         to_reflect(reflect, NAMES, subjects(columns, NAMES))

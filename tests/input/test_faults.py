@@ -43,7 +43,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def looked_at(folder):
+def checked_folder(folder):
     """What ``s4a check`` gives and prints, and the report of the call of Python in it."""
     reports, defaults = [], inspect.signature(read_shapes).parameters
 
@@ -61,13 +61,13 @@ def looked_at(folder):
 
 
 @pytest.fixture(scope="session")
-def checked(looked_at):
-    return looked_at[0]
+def checked(checked_folder):
+    return checked_folder[0]
 
 
 @pytest.fixture(scope="session")
-def in_python(looked_at):
-    return looked_at[1]
+def in_python(checked_folder):
+    return checked_folder[1]
 
 
 @pytest.fixture(scope="session")
@@ -81,7 +81,7 @@ def ran(folder, tmp_path_factory):
         yield code, text + re.sub(r"(?<=\w)- (?=\w)", "-", full), study
 
 
-def said(report, one):
+def message(report, one):
     return (
         report.attrs["remarks"]
         if one.where == "remarks"
@@ -98,11 +98,11 @@ def test_every_fault_has_its_outcome(name, in_python, checked, ran):
             assert name not in report["shape"].values
         else:
             row = report.sel(shape=name)
-            # ten functions on 100 vertices register some shapes wrongly, which a run says
+            # ten functions on 100 vertices register some shapes wrongly, which a run flags
             wrong = report is in_run and "registration" in row["flag_kinds"].item()
             assert row["status"].item() == ("flagged" if wrong else one.status)
-        if not (silent and report is in_run):  # a run has other things to say of them
-            assert re.search(one.said, said(report, one))
+        if not (silent and report is in_run):  # a run has other warnings
+            assert re.search(one.said, message(report, one))
     used = one.status in ("ok", "repaired", "flagged")
     assert (name in ran[2]["registration"]["shape"].values) == used
     for _, text, *_ in (checked, ran):
@@ -142,8 +142,8 @@ def test_the_documentation_is_current(in_python):
 
 def test_every_other_row_of_the_table_has_its_test():
     for file, test in table.proofs():
-        found = [*TESTS.rglob(file), *(ROOT / "morphometrics/tests").glob(file)]
-        texts = [path.read_text(encoding="utf-8") for path in found]
+        result = [*TESTS.rglob(file), *(ROOT / "morphometrics/tests").glob(file)]
+        texts = [path.read_text(encoding="utf-8") for path in result]
         assert any(f"def {test}(" in text for text in texts), (file, test)
 
 
@@ -187,20 +187,20 @@ def reference():
     return analyse(collection(), **OPTIONS)
 
 
-def test_the_study_does_not_depend_on_place_and_unit(reference):
+def test_the_study_does_not_depend_on_position_and_unit(reference):
     for factor, offset in ((1, 1e6), (1e-9, 0), (1e9, 0)):
-        found = analyse(collection(factor, offset), **OPTIONS)
-        one, other = (t["registration"].to_dataset() for t in (reference, found))
+        result = analyse(collection(factor, offset), **OPTIONS)
+        one, other = (t["registration"].to_dataset() for t in (reference, result))
         assert one.attrs["template"] == other.attrs["template"]
         assert np.allclose(other["displacement"] / factor, one["displacement"], atol=1e-3)
-        assert np.allclose(found["pca"]["score"], reference["pca"]["score"], atol=1e-3)
+        assert np.allclose(result["pca"]["score"], reference["pca"]["score"], atol=1e-3)
         assert (
-            found["report"]["warning"].values.tolist()
+            result["report"]["warning"].values.tolist()
             == reference["report"]["warning"].values.tolist()
         )
 
 
-def test_what_looks_wrong_with_a_new_shape_beside_a_study_is_told(reference):
+def test_a_suspect_new_shape_is_reported(reference):
     X, T = faulty.shape(5)
     given = {
         "good": X,
@@ -208,25 +208,23 @@ def test_what_looks_wrong_with_a_new_shape_beside_a_study_is_told(reference):
         "mirrored": X * [-1, 1, 1],
         "upside_down": X * [1, -1, -1],
     }
-    found = insert(reference, {name: (Y, T) for name, Y in given.items()})
-    warning = dict(
-        zip(
-            found["report"]["shape"].values.tolist(), found["report"]["warning"].values, strict=True
-        )
-    )
+    result = insert(reference, {name: (Y, T) for name, Y in given.items()})
+    report = result["report"]
+    names = report["shape"].values.tolist()
+    warning = dict(zip(names, report["warning"].values, strict=True))
     assert warning["good"] == ""
     assert "near 10^-3: another unit" in warning["metres"]
     assert "fits as a mirror image" in warning["mirrored"]
     assert warning["upside_down"] == ""  # the alignment turns it
     assert "near 10" not in warning["mirrored"]
-    assert np.ptp(found["original/metres"]["position"].values) == pytest.approx(np.ptp(X) / 1000)
+    assert np.ptp(result["original/metres"]["position"].values) == pytest.approx(np.ptp(X) / 1000)
     assert (
         insert(reference, {"mirrored": (given["mirrored"], T)}, compare=False)["report"]["warning"]
         == ""
     ).all()
 
 
-def test_files_of_different_units_are_told():
+def test_files_of_different_units_are_reported():
     meshes = {name: as_dataset(*mesh) for name, mesh in collection().items()}
     meshes["shape_0"].attrs |= {"unit": "mm", "coordinate_system": "RAS"}
     meshes["shape_1"].attrs |= {"unit": "m", "coordinate_system": "LPS"}
@@ -250,7 +248,7 @@ def test_of_two_mirror_images_none_is_the_right_one():
     )
 
 
-def test_an_odd_reference_does_not_make_the_others_odd():
+def test_a_suspect_reference_does_not_flag_the_others():
     X, T = faulty.shape()
     shapes = {f"s{i}": (Y, S) for i in range(4) for Y, S in [faulty.shape(i)]}
     reference = sorted(shapes, key=lambda n: as_area(*shapes[n]))[1]  # the one with the median area
@@ -265,7 +263,7 @@ def as_area(X, T):
     return np.linalg.norm(np.cross(X[T[:, 1]] - X[T[:, 0]], X[T[:, 2]] - X[T[:, 0]]), axis=1).sum()
 
 
-def test_reduced_numbers_are_told():
+def test_reduced_numbers_are_reported():
     meshes = {
         name: faulty.shape(i, n) for i, (name, n) in enumerate({"a": 60, "b": 20, "c": 60}.items())
     }
@@ -273,9 +271,9 @@ def test_reduced_numbers_are_told():
     assert "all 1 pairs of 2 shapes are used (n_pairs = 500)" in report.attrs["remarks"]
     assert report["status"].sel(shape="b").item() == "excluded"
     why = report["reason"].sel(shape="b").item()
-    assert re.search(r"only 1\d eigenfunctions, where 2 of 3 shapes have 40 or more", why)
+    assert re.search(r"only 1\d eigenfunctions, but 2 of 3 shapes have 40 or more", why)
     assert (
-        "all vertices are used, as there are fewer than n_coarse = 100"
+        "all vertices used, as there are fewer than n_coarse = 100"
         in report["reason"].sel(shape="a").item()
     )
 
@@ -289,7 +287,7 @@ def test_a_triangle_and_a_tetrahedron_end_no_run():
     assert np.isfinite(study["pca"]["score"]).all()
 
 
-def test_a_wrong_registration_is_told():
+def test_a_wrong_registration_is_flagged():
     wrong, remarks = flagged({"a": 0.0, "b": 0.02, "c": 0.1})
     assert list(wrong) == ["c"]
     assert [(one.kind, one.flagged) for one in wrong["c"]] == [("registration", True)]
@@ -298,7 +296,7 @@ def test_a_wrong_registration_is_told():
     assert flagged({"a": 0.0, "b": 0.12, "c": 0.1})[0] == {}
 
 
-def test_two_shapes_share_the_median_and_it_is_told():
+def test_two_shapes_share_the_median_with_a_remark():
     assert (
         "the median is not unique: a, b are equally near" in tied(["a", "b"], [0.1, 0.1 + 1e-12])[0]
     )

@@ -42,10 +42,10 @@ def test_a_ball_lies_where_its_affine_puts_it_and_keeps_its_volume(tmp_path, nam
     kind = nibabel.MGHImage if ".mg" in name else nibabel.Nifti1Image
     path = write(tmp_path / name, 17 * inside.astype(np.uint8), kind=kind)
     X, T, attrs = read_volume(path, 17)
-    place = AFFINE[:3, :3] @ middle + AFFINE[:3, 3]
-    np.testing.assert_allclose((X.max(0) + X.min(0)) / 2, place, atol=0.1)
+    position = AFFINE[:3, :3] @ middle + AFFINE[:3, 3]
+    np.testing.assert_allclose((X.max(0) + X.min(0)) / 2, position, atol=0.1)
     voxels = inside.sum() * abs(np.linalg.det(AFFINE[:3, :3]))
-    assert enclosed(X - place, T) == pytest.approx(voxels, rel=0.01), "positive: outwards"
+    assert enclosed(X - position, T) == pytest.approx(voxels, rel=0.01), "positive: outwards"
     assert (attrs["unit"], attrs["coordinate_system"]) == ("mm", "RAS")
 
 
@@ -59,7 +59,7 @@ def test_smoothing_takes_the_steps_of_the_voxels_and_does_not_shrink(tmp_path):
     assert enclosed(smooth - middle, T) == pytest.approx(inside.sum(), rel=0.006)
 
 
-def test_both_hands_of_an_affine_give_surfaces_seen_from_outside(tmp_path):
+def test_affine_maps_of_either_orientation_give_outward_triangles(tmp_path):
     inside, middle = ball()
     for sign in (1, -1):
         affine = np.diag([sign, 1, 1, 1.0])
@@ -81,16 +81,16 @@ def test_several_labels_are_one_structure(tmp_path):
     assert len(read_volume(path, 2)[0]) < len(X)
 
 
-def test_a_structure_at_the_border_is_closed_and_that_is_said(tmp_path):
+def test_a_structure_at_the_border_is_closed_with_a_note(tmp_path):
     inside, _ = ball(middle=[3, 15, 15])
     shape = s4a.read_shape(write(tmp_path / "a.nii", inside.astype(np.uint8)), label=1)
     assert shape.attrs["holes"] == 0
-    assert "reaches the border of the volume, where it was closed" in shape.attrs["reason"]
+    assert "reaches the border of the volume, and was closed there" in shape.attrs["reason"]
     whole = s4a.read_shape(write(tmp_path / "b.nii", ball()[0].astype(np.uint8)), label=1)
     assert "border" not in whole.attrs["reason"]
 
 
-def test_of_several_components_the_largest_stays_and_the_others_are_told(tmp_path):
+def test_the_largest_of_several_components_is_kept_and_the_others_reported(tmp_path):
     values = ball()[0].astype(np.uint8)
     values[1:4, 1:4, 1:4] = 1
     path = write(tmp_path / "a.nii", values)
@@ -122,8 +122,8 @@ def test_a_volume_that_does_not_say_how_it_lies_is_named(tmp_path):
     [
         (np.full((4, 4, 4), 3, np.int16), 17, "label 17 expected, found 3"),
         (np.arange(64).reshape(4, 4, 4), 99, r"label 99 expected, found 1, 2, .*, 30 \.\.\."),
-        (np.zeros((4, 4, 4), np.uint8), 17, "found 0 in every voxel"),
-        (np.zeros((4, 4, 4), np.uint8), "all", "found 0 in every voxel"),
+        (np.zeros((4, 4, 4), np.uint8), 17, ".*found 0 in every voxel"),
+        (np.zeros((4, 4, 4), np.uint8), "all", ".*found 0 in every voxel"),
         (np.full((4, 4, 4), 0.25, np.float32), 1, "integers expected"),
         (
             np.ones((4, 4, 4, 2), np.uint8),
@@ -182,13 +182,13 @@ def test_options_keep_their_labels_in_the_report():
 
 def test_a_volume_without_a_label_says_how_to_read_it(tmp_path):
     path = write(tmp_path / "a.nii.gz", ball()[0].astype(np.uint8))
-    with pytest.raises(ValueError, match=r"found a volume; with a label \(label=17, --label 17\)"):
+    with pytest.raises(ValueError, match=r"found a volume; give a label \(label=17, --label 17\)"):
         s4a.read_mesh(path)
 
 
 @pytest.fixture(scope="module")
 def volumes(tmp_path_factory):
-    """Four ellipsoids of label 17 in volumes, a mesh and a text beside them."""
+    """Four ellipsoids of label 17 in volumes, with a mesh and a text file in the folder."""
     folder = tmp_path_factory.mktemp("volumes")
     for i in range(5):
         axes = np.array([10, 7 + i / 2, 6 - i / 3])

@@ -42,7 +42,7 @@ def test_pickles_are_never_executed(tmp_path):
     np.savez(tmp_path / "b.npz", label=harm)
     np.savez(tmp_path / "c.npz", V=harm, **triangle)
     for read, name in ((read_labels, "a.npy"), (read_labels, "b.npz"), (read_mesh, "c.npz")):
-        with pytest.raises(ValueError, match=rf"{name}.*no pickled objects"):
+        with pytest.raises(ValueError, match=rf"{name}.*without pickled objects"):
             read(tmp_path / name)
         assert not made.exists()
     with np.load(tmp_path / "b.npz", allow_pickle=True) as arrays:  # that it would have done harm
@@ -51,7 +51,7 @@ def test_pickles_are_never_executed(tmp_path):
 
 
 def xml_files():
-    """A whole file of every format in XML, the name of its root, and what reads it."""
+    """A valid file of every format in XML, the name of its root, and its reader."""
     table = fuzz.seeds()
     readers = {"mesh": read_mesh, "labels": read_labels, "landmarks": read_landmarks}
     for name, root in (
@@ -150,8 +150,8 @@ def test_what_unpacks_to_more_than_64_mib_and_200_times_its_size_is_refused(tmp_
 def test_a_gifti_file_opens_no_other_file(tmp_path):
     file(tmp_path / "secret", bytes(12))
     text = GIFTI.format("LABEL", "INT32", 3, "ExternalFileBinary", "")
-    found = "data inside the file expected, found ExternalFileBinary secret"
-    with pytest.raises(ValueError, match=found):
+    result = "data inside the file expected, found ExternalFileBinary secret"
+    with pytest.raises(ValueError, match=result):
         read_labels(file(tmp_path / "a.gii", text))
 
 
@@ -167,7 +167,7 @@ def test_an_array_that_promises_more_than_its_file_is_refused_before_room_is_mad
                 read_labels(file(tmp_path / name, data))
 
 
-def test_many_arrays_at_one_place_of_a_file_count_each(tmp_path):
+def test_arrays_that_share_bytes_of_a_file_count_each(tmp_path):
     raw = bytes(600_000)
     body = np.array([1, len(raw), 0, len(p := zlib.compress(raw))], "<u4").tobytes() + p
     piece = '<DataArray type="Float32" format="appended" offset="0"/>'

@@ -14,10 +14,10 @@ T = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
 
 
 def same_surface(path, points=X, triangles=T):
-    found, corners, attrs = read_mesh(path)
-    assert found.dtype == np.float64
+    result, corners, attrs = read_mesh(path)
+    assert result.dtype == np.float64
     assert corners.dtype == np.int32
-    np.testing.assert_array_equal(found[corners], points[triangles])
+    np.testing.assert_array_equal(result[corners], points[triangles])
     return attrs
 
 
@@ -150,7 +150,7 @@ MESHES = [name for name, (_, kind, _) in SEEDS.items() if kind == "mesh" and nam
 
 
 def wholes(name):
-    """The whole files of a format from which damaged ones are made."""
+    """Valid files of a format, from which damaged ones are made."""
     return [finish(content) for content, finish in SEEDS[name][2] if finish is fuzz.whole]
 
 
@@ -158,8 +158,8 @@ def wholes(name):
 def test_every_encoding_of_a_format_gives_the_same_surface(tmp_path, name):
     points, triangles = fuzz.surface()
     for content in wholes(name):
-        found, corners, attrs = read_mesh(file(tmp_path, f"m{SEEDS[name][0]}", content))
-        np.testing.assert_allclose(found[corners], points[triangles], atol=1e-6)
+        result, corners, attrs = read_mesh(file(tmp_path, f"m{SEEDS[name][0]}", content))
+        np.testing.assert_allclose(result[corners], points[triangles], atol=1e-6)
         brain = {"coordinate_system": "RAS", "unit": "mm"}
         assert attrs == {"format": name} | (brain if name in ("GIFTI", "FreeSurfer") else {})
 
@@ -204,22 +204,22 @@ LACKS = "an element vertex with x, y and z expected, found"
 
 
 @pytest.mark.parametrize(
-    "before, after, found",
+    "before, after, words",
     [
         ("element vertex", "element point", f"{LACKS} point, face"),
         ("float z", "float w", f"{LACKS} an element vertex with x, y, w"),
-        ("float z", "real z", "of the types of PLY, expected, found 'property real z'"),
+        ("float z", "real z", "of a PLY type, expected, found 'property real z'"),
         ("format ascii", "format binary", "one of the formats .* in the header, found binary"),
     ],
 )
-def test_a_ply_says_what_its_header_lacks(tmp_path, before, after, found):
+def test_a_ply_says_what_its_header_lacks(tmp_path, before, after, words):
     head = (
         "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
         "property float z\n"
     )
     head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     (tmp_path / "m.ply").write_text(head.replace(before, after) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
-    with pytest.raises(ValueError, match=f"m.ply cannot be read as PLY: .*{found}"):
+    with pytest.raises(ValueError, match=f"m.ply cannot be read as PLY: .*{words}"):
         read_mesh(tmp_path / "m.ply")
 
 
@@ -264,12 +264,12 @@ def test_a_pattern_picks_one_structure_of_a_download(tmp_path):
 def test_names_are_unique_and_do_not_depend_on_the_order(tmp_path):
     names = "a/head.ply|b/head.ply|b/head.stl|b/HEAD.off|c/Kopf ä.ply|c/脳.ply|lh.pial|a_b.ply"
     touch(tmp_path, *names.split("|"))
-    found = find_meshes(tmp_path)
-    names = [name for _, name in found]
+    result = find_meshes(tmp_path)
+    names = [name for _, name in result]
     assert len({name.casefold() for name in names}) == len(names) == 8
     assert {"a_head", "b_head_ply", "b_head_stl", "lh_pial", "Kopf_a", slug("脳")} <= set(names)
-    assert find_meshes([path for path, _ in found[::-1]]) == found
-    assert find_meshes([tmp_path / "c", tmp_path, str(tmp_path / "**" / "*.ply")]) == found
+    assert find_meshes([path for path, _ in result[::-1]]) == result
+    assert find_meshes([tmp_path / "c", tmp_path, str(tmp_path / "**" / "*.ply")]) == result
 
 
 def test_accents_in_either_normal_form_give_one_name():
@@ -302,7 +302,7 @@ def test_published_brain_templates_are_read():
     assert attrs["unit"] == "mm"
 
 
-def test_what_lies_beside_the_meshes_of_a_folder_is_passed_over_and_named(tmp_path):
+def test_other_files_of_a_folder_are_skipped_and_named(tmp_path):
     write_mesh(tmp_path / "a.ply", X, T)
     np.savez(tmp_path / "scores.npz", score=np.zeros(3))
     (tmp_path / "a.json").write_text("{}")

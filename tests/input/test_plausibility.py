@@ -97,7 +97,7 @@ def test_if_half_has_another_unit_the_half_without_the_first_name_is_reported(de
     six = {name: data for name, data in descriptors.items() if name not in ("s6", "s7")}
     kinds, (remark,) = kinds_of(six | half)
     assert kinds == {name: ["unit!"] for name in half}
-    assert "with the ratio 10: s1, s3, s5, and the others" in remark
+    assert "with the ratio 9.98: s1, s3, s5, and the others" in remark
 
 
 def test_few_shapes_are_reported_only_if_no_deviation_is_needed(descriptors):

@@ -22,7 +22,7 @@ if sys.platform == "win32":
 
 FORGED = "f\ngood_0  excluded\x1b[2J\u202eylp.ply"  # what its name would write
 LONG = "n" * 249
-IRREGULAR = {  # file -> what is said of it
+IRREGULAR = {  # file -> message
     "pipe.ply": "found a named pipe",
     "pipe_labels.gii": "found a named pipe",
     "pipe_arrays.npz": "found a named pipe",
@@ -83,8 +83,8 @@ def test_what_is_no_regular_file_costs_itself_and_is_named_with_the_reason(folde
     assert sorted(report["shape"].values[excluded]) == sorted(
         name.partition(".")[0] for name in IRREGULAR
     )
-    for name, said in IRREGULAR.items():
-        assert said in report["reason"].sel(shape=name.partition(".")[0]).item()
+    for name, message in IRREGULAR.items():
+        assert message in report["reason"].sel(shape=name.partition(".")[0]).item()
     assert (
         "folder.ply is not a mesh (a folder, and its files were searched)"
         in (report.attrs["remarks"])
@@ -96,9 +96,10 @@ def test_what_is_no_regular_file_costs_itself_and_is_named_with_the_reason(folde
 
 
 def test_what_is_no_regular_file_is_refused_at_once_by_every_reader(folder):
-    for name, said in IRREGULAR.items():
+    for name, message in IRREGULAR.items():
         for read in (read_mesh, read_labels, read_landmarks, lambda path: read_table(path, ["a"])):
-            with pytest.raises(ValueError, match=rf"{name} cannot be read as .*{re.escape(said)}"):
+            expected = rf"{name} cannot be read as .*{re.escape(message)}"
+            with pytest.raises(ValueError, match=expected):
                 read(folder / name)
         assert find_meshes(folder / name)[0][0].name == name  # named by itself, it is tried
 
@@ -107,7 +108,7 @@ def test_what_is_no_regular_file_is_refused_at_once_by_every_reader(folder):
 def test_a_file_that_may_not_be_read_is_named(tmp_path):
     write_mesh(tmp_path / "secret.ply", *shape())
     (tmp_path / "secret.ply").chmod(0)
-    root = os.geteuid() == 0  # whom no mode keeps from reading
+    root = os.geteuid() == 0  # can read in spite of any mode
     if root:
         os.seteuid(65534)
     try:
@@ -125,7 +126,7 @@ def test_a_file_that_fails_while_it_is_read_is_named(tmp_path):
         read_mesh(tmp_path / "a.ply")
 
 
-def test_a_folder_that_cannot_be_searched_is_told(tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_searched_is_reported(tmp_path, monkeypatch):
     write_mesh(tmp_path / "a.ply", *shape())
     (tmp_path / "shut").mkdir()
     scandir = os.scandir
@@ -146,12 +147,12 @@ def test_names_of_shapes_are_unique_and_short_enough_for_the_files_of_a_study(fo
     assert len({name.casefold() for name in names}) == len(names)
     assert max(map(len, names)) == 100
     remarks = read_shapes(folder, compare=False)["report"].attrs["remarks"]
-    assert remarks.count("names of shapes have at most 100 letters") == 3
+    assert remarks.count("names of shapes have at most 100 characters") == 3
     alone = dict(find_meshes(folder, f"{LONG}1"))  # the name does not depend on other files
     assert set(alone.values()) < set(names)
 
 
-def test_a_name_writes_no_line_of_its_own(folder):
+def test_a_name_cannot_add_a_line(folder):
     code, text = printed("check", folder, "--no-intersections")
     assert code == 1  # as shapes were excluded
     assert "\x1b" not in text
@@ -169,18 +170,18 @@ def test_a_run_over_them_has_the_results_of_the_good_ones_alone(folder, tmp_path
     code, _ = printed("run", folder, "--out", tmp_path / "all", *SMALL, *more)
     assert code == 0
     reasons = open_study(tmp_path / "all")["report"]["reason"].values.tolist()
-    for name, said in IRREGULAR.items():
+    for name, message in IRREGULAR.items():
         reason = next(reason for reason in reasons if f"/{name} cannot be read" in reason)
-        assert said in reason
+        assert message in reason
     good = tmp_path / "good"
     good.mkdir()
     for path, _ in find_meshes(folder):
         if path.name not in IRREGULAR:
             (good / path.name).symlink_to(path)
     assert printed("run", good, "--out", tmp_path / "few", *SMALL, *more)[0] == 0
-    found, expected = (open_study(tmp_path / name)["pca"]["score"] for name in ("all", "few"))
-    assert found["shape"].values.tolist() == expected["shape"].values.tolist()
-    assert np.array_equal(found, expected)
+    result, expected = (open_study(tmp_path / name)["pca"]["score"] for name in ("all", "few"))
+    assert result["shape"].values.tolist() == expected["shape"].values.tolist()
+    assert np.array_equal(result, expected)
 
 
 def test_a_file_that_says_it_is_empty_is_read_to_its_end():

@@ -36,15 +36,15 @@ def folder(brains, tmp_path_factory):
     return folder
 
 
-def test_columns_are_whole_numbers_numbers_or_text_in_the_order_of_the_shapes(tmp_path):
+def test_columns_are_integers_numbers_or_text_in_the_order_of_the_shapes(tmp_path):
     file = tmp_path / "table.csv"
     file.write_text('age,shape,site,weight\n31,"b 1.ply",Bern,60.5\n40,a,,NA\n')
-    found = read_table(file, ["a", "b_1"])
-    assert found["age"].values.tolist() == [40, 31]
-    assert found["age"].dtype == np.int64
-    assert found["site"].values.tolist() == ["", "Bern"]
-    assert found["weight"].values == pytest.approx([np.nan, 60.5], nan_ok=True)
-    assert found["age"].attrs["long_name"] == "column 'age' of the table of the shapes"
+    result = read_table(file, ["a", "b_1"])
+    assert result["age"].values.tolist() == [40, 31]
+    assert result["age"].dtype == np.int64
+    assert result["site"].values.tolist() == ["", "Bern"]
+    assert result["weight"].values == pytest.approx([np.nan, 60.5], nan_ok=True)
+    assert result["age"].attrs["long_name"] == "column 'age' of the table of the shapes"
 
 
 def test_a_row_may_name_the_file_of_its_shape_with_folders_and_gz(tmp_path):
@@ -57,18 +57,18 @@ def test_a_row_may_name_the_file_of_its_shape_with_folders_and_gz(tmp_path):
         assert read_table(file, names)["age"].values.tolist() == [3, 4]
 
 
-def test_whole_numbers_that_no_integer_holds_are_numbers(tmp_path):
+def test_integers_that_are_too_large_are_floats(tmp_path):
     file = tmp_path / "table.csv"
     file.write_text(f"shape,size\na,1{30 * '0'}\nb,-1\n")
     assert read_table(file, ["a", "b"])["size"].values.tolist() == [1e30, -1.0]
 
 
-def test_digits_that_would_become_one_number_stay_apart(tmp_path):
+def test_digits_that_would_give_the_same_number_stay_text(tmp_path):
     file = tmp_path / "table.csv"
     file.write_text("shape,who,age\na,90071992547409931,01\nb,90071992547409932,2\nc,-,3\n")
-    found = read_table(file, ["a", "b", "c"])
-    assert found["who"].values.tolist() == ["90071992547409931", "90071992547409932", ""]
-    assert found["age"].values.tolist() == [1, 2, 3]
+    result = read_table(file, ["a", "b", "c"])
+    assert result["who"].values.tolist() == ["90071992547409931", "90071992547409932", ""]
+    assert result["age"].values.tolist() == [1, 2, 3]
     file.write_text("shape,who\na,01\nb,1\nc,2\n")
     assert read_table(file, ["a", "b", "c"])["who"].values.tolist() == ["01", "1", "2"]
 
@@ -76,16 +76,16 @@ def test_digits_that_would_become_one_number_stay_apart(tmp_path):
 def test_what_says_that_a_value_is_missing_is_neither_number_nor_text(tmp_path):
     file = tmp_path / "table.csv"
     file.write_text("shape,age,site\na,NA,n/a\nb,31,Bern\nc,-,-\nd,,NaN\n")
-    found = read_table(file, list("abcd"))
-    assert found["site"].values.tolist() == ["", "Bern", "", ""]
-    assert found["age"].values == pytest.approx([np.nan, 31, np.nan, np.nan], nan_ok=True)
+    result = read_table(file, list("abcd"))
+    assert result["site"].values.tolist() == ["", "Bern", "", ""]
+    assert result["age"].values == pytest.approx([np.nan, 31, np.nan, np.nan], nan_ok=True)
 
 
 def test_a_column_that_is_mostly_numbers_is_named_with_its_cells(tmp_path, caplog):
     file = tmp_path / "table.csv"
     file.write_text("shape;age;size;code\na;31;60,5;1a\nb;?;61,0;2a\nc;40;62,5;3\n")
-    found = read_table(file, list("abc"))
-    assert [found[name].dtype.kind for name in ("age", "size", "code")] == ["U"] * 3
+    result = read_table(file, list("abc"))
+    assert [result[name].dtype.kind for name in ("age", "size", "code")] == ["U"] * 3
     assert "'age' is mostly numbers, but 1 of 3 cells are not (b: '?')" in caplog.text
     assert "'size' is mostly numbers, but 3 of 3 cells are not (a: '60,5'" in caplog.text
     assert "'code'" not in caplog.text
@@ -101,10 +101,10 @@ def test_a_person_of_several_shapes_is_named(tmp_path, caplog):
 def test_rows_without_a_shape_are_ignored_and_shapes_without_a_row_lack_values(tmp_path, caplog):
     file = tmp_path / "table.csv"
     file.write_text("shape,site,age\na,Bern,31\nc.ply,Basel,42\n")
-    found = read_table(file, ["a", "b"])
-    assert found["shape"].values.tolist() == ["a", "b"]
-    assert found["site"].values.tolist() == ["Bern", ""]
-    assert found["age"].values == pytest.approx([31, np.nan], nan_ok=True)
+    result = read_table(file, ["a", "b"])
+    assert result["shape"].values.tolist() == ["a", "b"]
+    assert result["site"].values.tolist() == ["Bern", ""]
+    assert result["age"].values == pytest.approx([31, np.nan], nan_ok=True)
     assert "rows ignored, as no shape has their name: c.ply" in caplog.text
     assert "no row, so all values are missing: b" in caplog.text
 
@@ -113,8 +113,8 @@ def test_statistics_leave_out_a_shape_that_has_no_row_in_the_table(caplog):
     study = synthetic.example_study()
     names = study["registration"]["shape"].values.tolist()
     study["subjects"] = subjects({"age": np.arange(5) ** 2}, names[1:])
-    found = statistics.regression(study, "age", n_permutations=19)
-    assert found.attrs["left_out"] == names[0]
+    result = statistics.regression(study, "age", n_permutations=19)
+    assert result.attrs["left_out"] == names[0]
     assert names[0] in caplog.text
 
 
@@ -177,8 +177,8 @@ def test_a_table_of_other_meshes_is_named(folder, brains, tmp_path):
     given = {NAMES[0]: given[NAMES[1]], NAMES[1]: given[NAMES[1]], NAMES[5]: brains[NAMES[5]]}
     with analyse(given, store=work, **OPTIONS) as other:
         remarks = other["report"].attrs["remarks"]
-    assert "three.csv, is kept, but it has no row for brain_06; it has rows for what is" in remarks
-    assert "no shape now: brain_03; other meshes have taken the names brain_01: give" in remarks
+    assert "three.csv, is kept, but it has no row for brain_06; it has rows for other" in remarks
+    assert "other shapes: brain_03; the meshes have changed: brain_01: give" in remarks
 
 
 def test_statistics_take_columns_and_say_which_values_are_missing(folder):
@@ -206,18 +206,18 @@ def test_shapes_without_a_value_are_left_out_of_the_test_and_named(folder, caplo
     holes = xr.DataTree.from_dict(
         {"registration": registration, "subjects": table.where(table["age"] < 50)}
     )
-    found = statistics.regression(holes, "age", n_permutations=9)
+    result = statistics.regression(holes, "age", n_permutations=9)
     assert "no value for 1 of 6 shapes, which are excluded from the test: brain_06" in caplog.text
     five = registration.isel(shape=slice(5))
     alone = statistics.regression(
         xr.DataTree.from_dict({"registration": five}), table["age"].values[:5], n_permutations=9
     )
-    assert found.attrs["left_out"] == "brain_06"
-    assert found.drop_attrs().identical(alone.drop_attrs())
-    assert statistics.regression_modes(holes, found)["pca"]["shape"].size == 5
+    assert result.attrs["left_out"] == "brain_06"
+    assert result.drop_attrs().identical(alone.drop_attrs())
+    assert statistics.regression_modes(holes, result)["pca"]["shape"].size == 5
 
 
-def test_a_table_can_take_the_place_of_the_first(folder):
+def test_a_table_can_replace_the_first(folder):
     (folder / "site.csv").write_text("shape,site\n" + "".join(f"{n},x\n" for n in NAMES[:6]))
     with open_study(folder / "study") as study:
         other = with_table(study, folder / "site.csv")
@@ -242,23 +242,23 @@ def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch)
         "19",
     ]
     assert cli.main(command) == 0
-    said, out = capsys.readouterr().out, folder / "study" / "statistics"
+    message, out = capsys.readouterr().out, folder / "study" / "statistics"
     for words in (
         "groups of sex (f: 3, m: 3)",
         "family-wise",
         "outliers:",
         "lengths in mm",
     ):
-        assert words in said, words
+        assert words in message, words
     assert (out / "regression.html").read_text() == "1"
     assert (out / "regression.gif").read_bytes()[:3] == b"GIF"
     rows = (out / "outliers.shape.csv").read_text().splitlines()
     assert rows[0] == "shape,mahalanobis,outlier_p,left_out_error,outlier"
     assert [row.split(",")[0] for row in rows[1:]] == NAMES[:6]
     evaluation = np.genfromtxt(out / "evaluation.component.csv", delimiter=",", names=True)
-    with xr.open_dataset(out / "evaluation.nc") as found:
-        assert evaluation["compactness"] == pytest.approx(found["compactness"].values)
-        assert evaluation["component"].tolist() == list(range(1, found.sizes["component"] + 1))
+    with xr.open_dataset(out / "evaluation.nc") as result:
+        assert evaluation["compactness"] == pytest.approx(result["compactness"].values)
+        assert evaluation["component"].tolist() == list(range(1, result.sizes["component"] + 1))
     for name in ("group", "group_map", "classification", "regression"):
         assert (out / f"{name}.nc").is_file(), name
     assert cli.main(["statistics", str(folder / "study"), "--group", "site"]) == 2
@@ -269,7 +269,7 @@ def test_the_command_refuses_what_makes_no_test_and_says_a_warning_once(folder, 
     command = ["statistics", str(folder / "study"), "--out", str(folder / "few")]
     for n in ("-1", "0", str(10**9)):
         assert cli.main([*command, "--group", "sex", "--permutations", n]) == 2
-        assert f"a number from 1 to 10000000, found {n}" in capsys.readouterr().err
+        assert f"a number from 1 to 10000000; found {n}" in capsys.readouterr().err
     caplog.clear()
     flags = ["--group", "sex", "--covariates", "score", "--permutations", "9"]
     assert cli.main([*command, *flags, "--variances", "unequal"]) == 0
@@ -293,9 +293,9 @@ def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
         "1",
     ]
     assert cli.main(command) == 1  # one of them is excluded
-    said = capsys.readouterr().out.splitlines()
-    assert said[0].split()[:4] == ["shape", "confidence", "round", "trip"]
-    assert "excluded" in said[2]
+    message = capsys.readouterr().out.splitlines()
+    assert message[0].split()[:4] == ["shape", "confidence", "round", "trip"]
+    assert "excluded" in message[2]
     with (
         xr.open_datatree(tmp_path / "out" / "inserted.nc") as tree,
         open_study(folder / "study") as study,
@@ -309,7 +309,7 @@ def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "data, said",
+    "data, message",
     [
         ("shape,âge\na,1\n".encode("utf-16"), "found UTF-16: save it as CSV UTF-8"),
         ("shape,age\na,1\n".encode("utf-16-le"), "found UTF-16: save it as CSV UTF-8"),
@@ -324,15 +324,16 @@ def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
         (b"\xef\xbb\xbf", "the file is empty"),
     ],
 )
-def test_a_table_in_another_encoding_is_told_with_what_it_seems_to_be(tmp_path, data, said):
+def test_a_table_in_another_encoding_is_an_error_that_names_the_encoding(tmp_path, data, message):
     file = tmp_path / "table.csv"
     file.write_bytes(data)
-    with pytest.raises(ValueError, match=rf"table.csv cannot be read as a table: .*{said}"):
+    with pytest.raises(ValueError, match=rf"table.csv cannot be read as a table: .*{message}"):
         read_table(file, ["a"])
-    with pytest.raises(ValueError, match=rf"table.csv cannot be read as labels: .*{said}"):
+    with pytest.raises(ValueError, match=rf"table.csv cannot be read as labels: .*{message}"):
         read_labels(file.rename(tmp_path / "labels_table.csv"))
     if not data.startswith(b"PK"):
-        with pytest.raises(ValueError, match=rf"table.csv cannot be read as landmarks: .*{said}"):
+        expected = rf"table.csv cannot be read as landmarks: .*{message}"
+        with pytest.raises(ValueError, match=expected):
             read_landmarks(tmp_path / "labels_table.csv")
 
 

@@ -1,6 +1,6 @@
-"""What each term of a score, each stop and each threshold of the method decides.
+"""Effect of each term of a score, each stopping criterion and each threshold of the method.
 
-Most of these were chosen by measurement; a test of a whole study would pass without one of them.
+Most values were tuned by measurement; tests of a whole study pass without any one of them.
 """
 
 from dataclasses import replace
@@ -18,7 +18,7 @@ from s4a.method.shape import Basis, Shape
 
 
 def basis(X, T, **more):
-    """A surface with one constant function, its area made one."""
+    """A surface of unit area with one constant function."""
     area = vertex_areas(X, T)
     return Basis(X / np.sqrt(area.sum()), T, area / area.sum(), np.ones((len(X), 1)), **more)
 
@@ -30,7 +30,7 @@ def sphere():
 
 
 def hemisphere(whole):
-    """The upper half of a surface, as it lies, and the vertex of the whole at each of its own."""
+    """Return the upper half of a surface, and the index of each of its vertices in the whole."""
     upper = np.flatnonzero(whole.X[:, 2] > 0)
     row = np.full(len(whole.X), -1)
     row[upper] = np.arange(len(upper))
@@ -46,7 +46,7 @@ def hemisphere(whole):
 
 
 def far(X, Y):
-    """Of each of the points X, the distance of the nearest of Y."""
+    """Return the distance from each point of X to the nearest point of Y."""
     return np.linalg.norm(X[:, None] - Y[None], axis=2).min(axis=1)
 
 
@@ -64,20 +64,20 @@ def test_what_the_target_does_not_cover_of_the_source_is_in_the_score(sphere):
 def test_what_the_source_lacks_of_the_target_is_in_the_score(sphere):
     half, _ = hemisphere(sphere)
     match = half.tree.query(sphere.tree.data)[1]
-    gap = np.linalg.norm(sphere.X - half.X[match], axis=1).mean()
-    assert gap > 0.05
-    assert spectral_icp.registration_score(half, sphere, match, sphere) >= gap
+    distance = np.linalg.norm(sphere.X - half.X[match], axis=1).mean()
+    assert distance > 0.05
+    assert spectral_icp.registration_score(half, sphere, match, sphere) >= distance
 
 
 def test_a_match_that_slides_is_in_the_score_by_its_distance_and_by_its_path(sphere):
-    turn = 0.3
-    c, s = np.cos(turn), np.sin(turn)
+    angle = 0.3
+    c, s = np.cos(angle), np.sin(angle)
     slid = sphere.X @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     match = np.argmin(np.linalg.norm(slid[:, None] - sphere.X[None], axis=2), axis=1)
-    gap = np.linalg.norm(sphere.X - sphere.X[match], axis=1).mean()
+    distance = np.linalg.norm(sphere.X - sphere.X[match], axis=1).mean()
     # a path along edges is up to a tenth longer than the arc
     score = spectral_icp.registration_score(sphere, sphere, match, sphere)
-    assert 1.95 * gap < score < 2.3 * gap
+    assert 1.95 * distance < score < 2.3 * distance
 
 
 def test_a_round_trip_is_counted_up_to_half_the_size_of_the_surface(sphere):
@@ -94,10 +94,10 @@ def test_the_distance_of_landmarks_is_added_to_the_score(sphere):
 
 
 @pytest.mark.parametrize("share, expected", [(0.85, False), (1.15, True)])
-def test_poses_are_far_apart_from_0_035_and_four_tenths_of_the_spacing_on(sphere, share, expected):
+def test_poses_differ_above_0_035_plus_four_tenths_of_the_spacing(sphere, share, expected):
     stretched = sphere.X * [1, 1, 0]  # what moves along the axis is not rigid
-    gap = np.quantile(np.abs(stretched - sphere.X)[:, 2], 0.9)
-    factor = share * (0.035 + 0.4 / np.sqrt(len(sphere.X))) / gap
+    distance = np.quantile(np.abs(stretched - sphere.X)[:, 2], 0.9)
+    factor = share * (0.035 + 0.4 / np.sqrt(len(sphere.X))) / distance
     source = sphere.moved_to(sphere.X * [1, 1, 1 + factor])
     assert spectral_icp.poses_differ(source, sphere, np.arange(len(sphere.X))) == expected
 
@@ -122,7 +122,7 @@ def surface():
 
 
 def ends(surface, X, **changed):
-    """Where the vertices of a surface end on the same surface moved to X."""
+    """Return the registered vertices of a surface on the same surface moved to X."""
     begin = np.eye(3), np.zeros(3), np.zeros((1, 3))
     schedule = elastic.DEFORMATION._replace(**changed)
     return spectral_icp.move(
@@ -158,24 +158,26 @@ def test_the_latent_size_is_the_nearest_whole_number_to_its_share(k, expected):
     assert latent.latent_size(25, k, 100) == expected  # 5.25 is 5, 5.75 is 6, 7.5 is 8
 
 
-def test_starts_that_end_within_a_hundredth_of_each_other_go_on_as_their_mean(surface, monkeypatch):
+def test_initialisations_that_end_within_a_hundredth_are_merged_into_their_mean(
+    surface, monkeypatch
+):
     monkeypatch.setattr(
-        elastic, "elastic_iterations", lambda _source, _target, start, *_, **__: start
+        elastic, "elastic_iterations", lambda _source, _target, initial_warp, *_, **__: initial_warp
     )
 
-    def start(x):
+    def initial_warp(x):
         return np.eye(3), np.array([x, 0.0, 0.0]), np.zeros((1, 3))
 
-    starts = {"a": start(0.0), "b": start(0.008), "c": start(0.02)}
-    met = elastic.converging_initialisations(surface, surface, starts)
-    assert list(met) == ["a", "c"]
-    assert met["a"][1] == pytest.approx([0.004, 0, 0])
+    warps = {"a": initial_warp(0.0), "b": initial_warp(0.008), "c": initial_warp(0.02)}
+    merged = elastic.converging_initialisations(surface, surface, warps)
+    assert list(merged) == ["a", "c"]
+    assert merged["a"][1] == pytest.approx([0.004, 0, 0])
 
 
 # ---- initial maps
 
 
-def test_landmarks_on_a_line_do_not_decide_the_turn_about_it(surface):
+def test_collinear_landmarks_do_not_determine_the_rotation(surface):
     X, tree = surface.X, cKDTree(surface.X)
     ends = [np.argmin(X[:, 0]), np.argmax(X[:, 0])]
     # the third is a vertex next to the first in one shape, and the opposite one in the other
@@ -187,7 +189,7 @@ def test_landmarks_on_a_line_do_not_decide_the_turn_about_it(surface):
     np.testing.assert_allclose(t, 0, atol=1e-6)
 
 
-def test_of_searched_maps_that_fit_alike_the_one_that_keeps_curvatures_is_taken(
+def test_of_maps_with_equal_scores_the_one_that_preserves_curvatures_is_chosen(
     surface, monkeypatch
 ):
     C = np.eye(10)
@@ -195,9 +197,9 @@ def test_of_searched_maps_that_fit_alike_the_one_that_keeps_curvatures_is_taken(
     monkeypatch.setattr(initial_map, "stretch", lambda *_: 0.0)
 
     def found(search):
-        scores, gaps = iter([0.10, 0.11, 0.5]), iter([0.1, 0.0, 0.0])
+        scores, differences = iter([0.10, 0.11, 0.5]), iter([0.1, 0.0, 0.0])
         monkeypatch.setattr(spectral_icp, "registration_score", lambda *_: next(scores))
-        monkeypatch.setattr(initial_map.fmap, "curvature_difference", lambda *_: next(gaps))
+        monkeypatch.setattr(initial_map.fmap, "curvature_difference", lambda *_: next(differences))
         return initial_map.best_initial_map(surface, surface, C, search=search)[0]
 
     assert found(search=False) == "icp"

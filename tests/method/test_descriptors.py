@@ -123,7 +123,7 @@ def test_products_act_on_functions_of_the_basis(shape):
         assert P[:, 0] == pytest.approx(Phi.T @ (area * column), abs=1e-9)  # the product with 1
 
 
-def test_the_orientation_operator_of_x_takes_y_to_1_on_a_square_and_to_minus_1_turned_over():
+def test_the_orientation_operator_of_x_maps_y_to_1_on_a_square_and_to_minus_1_if_flipped():
     x, y = np.meshgrid(np.linspace(0, 2, 9), np.linspace(0, 3, 7), indexing="ij")
     X = np.c_[x.ravel(), y.ravel(), np.zeros(x.size)]
     i, j = np.meshgrid(np.arange(8), np.arange(6), indexing="ij")
@@ -212,8 +212,8 @@ def test_the_fit_is_where_that_of_pyfm_ends(brains, oriented):
     ends = []
     for mesh, f in ((peer.mesh1, peer.descr1), (peer.mesh2, peer.descr2)):
         Phi, area = mesh.eigenvectors[:, :k], mesh.A.diagonal()
-        turn = fmap.orientation(mesh.faces, Phi, f)
-        ends.append((Phi.T @ (area[:, None] * f), fmap.multiplication(Phi, area, f), turn))
+        operator = fmap.orientation(mesh.faces, Phi, f)
+        ends.append((Phi.T @ (area[:, None] * f), fmap.multiplication(Phi, area, f), operator))
     (F, P, W), (G, Q, V) = ends
     mask = weights.resolvent_mask(peer.mesh1.eigenvalues[:k], peer.mesh2.eigenvalues[:k])
     tau = weights.canonical_taus(F, G, (P, Q), (W, V) if oriented else [], mask)

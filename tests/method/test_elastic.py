@@ -1,4 +1,4 @@
-"""Elastic iterations: what they minimise, what they find again, and that they stay at the truth."""
+"""Elastic iterations: the energy they minimise, recovery of deformations, and accuracy."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ from s4a.study.pair import shape_of
 
 @pytest.fixture(scope="module")
 def pair():
-    """A template, a shape of other vertices, and where the former's vertices are on the latter."""
+    """A template, a shape with other vertices, and the true image of the template's vertices."""
     tree = synthetic.brains(2, 3000, seed=5)
     options = Options(n_coarse=1500, k=60)
     template, shape = (
@@ -37,15 +37,15 @@ def pair():
     return template, shape, shape.to_frame(at)
 
 
-def starts(template, shape):
-    """Two starts: the shapes as they lie, and a match that is 0.1 off everywhere."""
+def initial_warps(template, shape):
+    """Two initialisations: the given alignment, and a match with an error of 0.1 everywhere."""
     near = shape.low.tree.query(template.low.tree.data)[1]
     off = shape.low.tree.query(template.low.tree.data + [0.5, 0, 0, 0, 0, 0])[1]
     return [spectral_icp.fit_warp(shape.low, template.low, match) for match in (near, off)]
 
 
-def error(image, truth):
-    return np.linalg.norm(image - truth, axis=1).mean()
+def error(image, true_image):
+    return np.linalg.norm(image - true_image, axis=1).mean()
 
 
 @pytest.fixture(scope="module")
@@ -53,28 +53,28 @@ def ends(pair):
     template, shape, _ = pair
     return [
         elastic.elastic_iterations(shape.full, template.low, warp)
-        for warp in starts(template, shape)
+        for warp in initial_warps(template, shape)
     ]
 
 
-def test_they_end_nearer_to_the_truth_than_joint_rounds(pair, ends):
-    template, shape, truth = pair
+def test_they_are_more_accurate_than_spectral_icp(pair, ends):
+    template, shape, true_image = pair
     near = shape.low.tree.query(template.low.tree.data)[1]
     warp = spectral_icp.coarse_spectral_icp(shape.low, template.low, near, k=60)[1]
     warp = spectral_icp.dense_spectral_icp(shape.full, template.full, warp)[1]
-    by_joint = error(spectral_icp.move(template.full, warp), truth)
-    by_elastic = error(spectral_icp.move(template.full, ends[0]), truth)
+    by_joint = error(spectral_icp.move(template.full, warp), true_image)
+    by_elastic = error(spectral_icp.move(template.full, ends[0]), true_image)
     assert by_elastic < 0.5 * by_joint
 
 
-def test_two_starts_end_at_one_place(pair, ends):
+def test_two_initialisations_converge_to_one_registration(pair, ends):
     template, shape, _ = pair
-    begin = [spectral_icp.move(template.full, warp) for warp in starts(template, shape)]
+    begin = [spectral_icp.move(template.full, warp) for warp in initial_warps(template, shape)]
     end = [spectral_icp.move(template.full, warp) for warp in ends]
     assert error(*end) < 0.05 * error(*begin)
 
 
-def test_no_triangle_is_turned_over(pair, ends):
+def test_no_triangle_is_flipped(pair, ends):
     template, _, _ = pair
     T = template.full.T
     image = spectral_icp.move(template.full, ends[0])
@@ -110,15 +110,15 @@ def test_the_normal_equations_are_those_of_the_sum():
         assert slope == pytest.approx(2 * (matrix @ w - right) @ v, rel=1e-5)  # float32
 
 
-def test_nearest_points_lie_on_the_surface_and_no_farther_than_nearest_vertices(pair):
+def test_nearest_points_are_on_the_surface_and_not_farther_than_nearest_vertices(pair):
     template, shape, _ = pair
     X, T = template.low.X, template.low.T
     points, normals = elastic.nearest_on_surface(shape.full, X, vertex_normals(X, T))
     assert distance_to_surface(points, shape.full.X, shape.full.T).max() < 1e-9
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1)
     vertex = spectral_icp.nearest_vertices(shape.full, template.low.moved_to(X))
-    gap = np.linalg.norm(points - X, axis=1).mean()
-    assert gap < 0.9 * np.linalg.norm(shape.full.X[vertex] - X, axis=1).mean()
+    distance = np.linalg.norm(points - X, axis=1).mean()
+    assert distance < 0.9 * np.linalg.norm(shape.full.X[vertex] - X, axis=1).mean()
 
 
 @pytest.fixture(scope="module")
@@ -129,25 +129,25 @@ def local(pair, ends):
     return X, elastic.local_iterations(shape.full, template.low, template.diffusion, X)
 
 
-def gap(X, shape):
+def surface_distance(X, shape):
     return distance_to_surface(X, shape.full.X, shape.full.T).mean()
 
 
-def test_local_rounds_come_nearer_to_the_surface_and_stay_as_near_to_the_truth(pair, ends, local):
-    template, shape, truth = pair
+def test_local_iterations_reduce_the_surface_distance_and_keep_the_accuracy(pair, ends, local):
+    template, shape, true_image = pair
     X, d = local
-    assert gap(X + d, shape) < 0.8 * gap(X, shape)
+    assert surface_distance(X + d, shape) < 0.8 * surface_distance(X, shape)
     before = spectral_icp.move(template.full, ends[0])
     after = before + template.U @ d
-    # what elastic iterations have followed to its end is as smooth as the truth; the rest is noise
-    assert error(after, truth) < 1.2 * error(before, truth)
+    # the deformation is as smooth as elastic iterations can fit; the residual is noise
+    assert error(after, true_image) < 1.2 * error(before, true_image)
 
 
-def test_local_rounds_find_a_bump_that_no_function_of_the_basis_has(pair):
+def test_local_iterations_fit_a_bump_outside_the_span_of_the_basis(pair):
     template, _, _ = pair
     low = template.low
-    place = low.X[100]
-    bump = 0.01 * np.exp(-((low.X - place) ** 2).sum(1) / (2 * 0.05**2))[:, None] * low.normals
+    point = low.X[100]
+    bump = 0.01 * np.exp(-((low.X - point) ** 2).sum(1) / (2 * 0.05**2))[:, None] * low.normals
     source = replace(low, X=low.X + bump)
     d = elastic.local_iterations(source, low, template.diffusion, low.X)
     assert np.linalg.norm(d - bump, axis=1).max() < 0.4 * np.linalg.norm(bump, axis=1).max()
@@ -156,7 +156,7 @@ def test_local_rounds_find_a_bump_that_no_function_of_the_basis_has(pair):
     assert np.linalg.norm(d - bump, axis=1).mean() < 0.5 * np.linalg.norm(left, axis=1).mean()
 
 
-def test_a_local_round_is_a_step_of_heat_diffusion(pair):
+def test_a_local_iteration_is_a_step_of_heat_diffusion(pair):
     template, shape, _ = pair
     low, time = template.low, 0.01
     d = elastic.local_iterations(
@@ -174,13 +174,13 @@ def test_on_the_surface_itself_nothing_is_left_to_do(pair):
     assert np.abs(elastic.local_iterations(low, low, template.diffusion, low.X)).max() < 1e-12
 
 
-def test_where_parts_turned_on_their_own_local_rounds_alone_follow(pair, monkeypatch):
+def test_piecewise_rigid_candidates_get_local_iterations_only(pair, monkeypatch):
     template, shape, _ = pair
 
     def never(*_args, **_options):
         raise AssertionError("elastic iterations begin at one transform for all")
 
-    one = starts(template, shape)[0]
+    one = initial_warps(template, shape)[0]
     n = len(template.low.X)
     parts = np.repeat(one[0][None], n, 0), np.repeat(one[1][None], n, 0), one[2]
     candidate = spectral_icp.Candidate(0.0, np.zeros(n, int), parts)
@@ -194,30 +194,30 @@ def test_where_parts_turned_on_their_own_local_rounds_alone_follow(pair, monkeyp
         "icp+parts",
         "icp+parts+local",
     }
-    far = {asked: gap(end.X, shape) for asked, (_, end, _) in found.items()}
-    assert far[True] < 0.8 * far[False]
+    distances = {asked: surface_distance(end.X, shape) for asked, (_, end, _) in found.items()}
+    assert distances[True] < 0.8 * distances[False]
 
 
-def test_starts_that_meet_go_on_as_one_and_others_are_both_kept(pair):
+def test_converging_initialisations_are_merged_and_others_stay_separate(pair):
     template, shape, _ = pair
-    here, there = starts(template, shape)[:2]
-    turn = np.diag([-1.0, -1.0, 1.0])  # half a turn
-    away = turn @ here[0], turn @ here[1], here[2] @ turn
+    here, there = initial_warps(template, shape)[:2]
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    away = half_turn @ here[0], half_turn @ here[1], here[2] @ half_turn
     found = elastic_surfaces(shape, template, {"here": here, "there": there, "away": away})
     assert set(found) == {"here", "away"}
     alone = elastic_surfaces(shape, template, {"there": there})["there"]
     assert np.linalg.norm(alone - found["here"], axis=1).mean() < 1e-3
 
 
-def test_which_of_two_starts_that_meet_is_the_first_does_not_matter(pair):
+def test_the_order_of_converging_initialisations_does_not_matter(pair):
     template, shape, _ = pair
-    here, there = starts(template, shape)[:2]
+    here, there = initial_warps(template, shape)[:2]
     one = elastic_surfaces(shape, template, {"here": here, "there": there})["here"]
     other = elastic_surfaces(shape, template, {"there": there, "here": here})["there"]
     assert np.allclose(one, other, atol=1e-9)
 
 
-def test_rounds_that_begin_less_stiff_are_nearer_where_the_template_is_torn(
+def test_less_stiff_iterations_are_more_accurate_for_a_strained_template(
     monkeypatch,
 ):
     tree = synthetic.brains(4, 2500, seed=25)
@@ -241,7 +241,7 @@ def test_rounds_that_begin_less_stiff_are_nearer_where_the_template_is_torn(
     assert error < 0.7 * error_before
 
 
-def test_a_looser_end_is_kept_where_score_and_tear_fall_together(pair):
+def test_a_less_stiff_result_is_chosen_if_score_and_strain_decrease_together(pair):
     N = pair[0].full
     near = np.exp(-40 * ((N.X - N.X[0]) ** 2).sum(1))
 
@@ -252,8 +252,8 @@ def test_a_looser_end_is_kept_where_score_and_tear_fall_together(pair):
     torn = end(1.0, 0.8)
     assert strain_quantile(end(1.0, 0.0)[1], N) == pytest.approx(0, abs=1e-9)
     assert strain_quantile(torn[1], N) > MAX_STRAIN
-    assert improves(end(0.97, 0.3), torn, N)  # on the right fold: a little nearer, hardly torn
-    assert not improves(end(0.91, 1.0), torn, N)  # it follows noise: nearer, and more torn
+    assert improves(end(0.97, 0.3), torn, N)  # right fold: slightly better score, little strain
+    assert not improves(end(0.91, 1.0), torn, N)  # fits noise: better score, more strain
     assert not improves(end(2.0, 0.5), torn, N)  # merely stiffer
 
 
@@ -335,10 +335,10 @@ def test_a_shape_that_ends_elsewhere_keeps_its_boundary(monkeypatch):
 
 
 @pytest.mark.parametrize("below", [-1e-11, -1e-7])
-def test_a_direction_that_rounding_leaves_below_nothing_is_not_taken(below):
+def test_a_direction_with_a_negative_eigenvalue_by_rounding_is_truncated(below):
     axes = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
-    told = np.array([1.0, 0.5, 1e-6, below])
-    matrix = axes * told @ axes.T
+    eigenvalues = np.array([1.0, 0.5, 1e-6, below])
+    matrix = axes * eigenvalues @ axes.T
     matrix = (matrix + matrix.T) / 2
     right = axes @ np.array([1.0, 1.0, 1e-6, 1e-6])
     with pytest.raises(np.linalg.LinAlgError):

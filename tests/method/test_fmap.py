@@ -23,7 +23,7 @@ def shape(low_brain):
 
 @pytest.fixture(scope="module")
 def permuted(shape):
-    """The same shape with its vertices renumbered and some signs turned.
+    """The same shape with its vertices renumbered and some signs flipped.
 
     And the match from it to the shape.
     """
@@ -35,7 +35,7 @@ def permuted(shape):
 
 
 def basis(Phi, area, eigenvalue=None):
-    """Functions alone: the steps of this file ask for no surface."""
+    """Functions alone: these tests need no surface."""
     return Basis(None, None, area, Phi, eigenvalue)
 
 
@@ -75,7 +75,7 @@ def test_zoomout_ends_at_k_whatever_the_step(shape):
     assert (fmap.zoomout(same, same, np.eye(40), 40)[0] == np.eye(40)).all()
 
 
-def test_a_step_on_spread_vertices_mends_a_map_about_as_well_as_one_on_all(shape, permuted):
+def test_a_step_on_samples_refines_a_map_about_as_well_as_one_on_all_vertices(shape, permuted):
     Phi, area, _, X = shape
     Psi, area_target, _, Y, _, sign = permuted
     source, target = (
@@ -146,7 +146,7 @@ def test_nearest_rows_are_those_of_a_float64_search(d):
     assert (nearest_rows(Q, D, block=700) == cKDTree(D).query(Q)[1]).all()
 
 
-def test_rows_that_float32_cannot_tell_apart_are_told_apart():
+def test_rows_within_float32_rounding_are_distinguished():
     rng = np.random.default_rng(0)
     D = np.repeat(rng.normal(size=(300, 30)), 2, axis=0)
     D[::2] += 1e-9

@@ -1,6 +1,6 @@
-"""Shapes in far poses: parts that turn on their own, initial maps that no pose changes.
+"""Shapes in different poses: piecewise rigid transforms, and initial maps independent of pose.
 
-And who pays for them.
+And when they are computed.
 """
 
 from dataclasses import replace
@@ -51,7 +51,7 @@ def shapes(bent):
     return [Shape(mesh, spectrum(coarsen(mesh, n_coarse=1000), k=50)) for mesh in bent]
 
 
-def test_a_far_pose_is_matched_where_nearest_neighbours_begin_wrong(bent, monkeypatch):
+def test_a_different_pose_is_matched_although_nearest_neighbours_are_wrong(bent, monkeypatch):
     found = match_pair(*bent, n_coarse=1000, k=50)
     assert found.attrs["initialisation"] == "intrinsic+parts+local"
     assert found.attrs["initial_map"].split(",")[0] in ("hks", "wks", "hks+wks", "extremities 1")
@@ -75,13 +75,13 @@ def test_parts_follow_a_bend_that_displacements_alone_cannot(shapes):
     X = (X - shapes[1].frame[0]) / shapes[1].frame[1]
     few = straight.Phi[:, :20]
 
-    def gap(spectrum):
+    def residual(spectrum):
         R, t, c = deform.onto(
             straight.X, X, straight.area, lambda d: few.T @ (straight.area[:, None] * d), spectrum
         )
         return np.linalg.norm(spectral_icp.move(straight, (R, t, c)) - X, axis=1).mean()
 
-    assert gap((straight.area, few, straight.eigenvalue[:20])) < 0.25 * gap(None)
+    assert residual((straight.area, few, straight.eigenvalue[:20])) < 0.25 * residual(None)
 
 
 def test_the_parts_of_the_full_resolution_are_those_of_its_coarse_vertices(shapes):
@@ -95,7 +95,7 @@ def test_the_parts_of_the_full_resolution_are_those_of_its_coarse_vertices(shape
     )
 
 
-def test_shapes_in_one_pose_pay_nothing_and_keep_their_first_map(monkeypatch):
+def test_shapes_in_one_pose_keep_their_initial_map(monkeypatch):
     tree = synthetic.brains(2, 1500)
     source, target = (node.to_dataset() for node in tree["original"].children.values())
 
@@ -106,20 +106,20 @@ def test_shapes_in_one_pose_pay_nothing_and_keep_their_first_map(monkeypatch):
     assert match_pair(source, target, n_coarse=600, k=40).attrs["initial_map"] == "dense"
 
 
-def test_poses_are_far_apart_only_where_no_rigid_motion_brings_the_shapes_together(shapes):
+def test_poses_differ_only_if_no_rigid_transform_aligns_the_shapes(shapes):
     M, N = (s.low for s in shapes)
     assert not spectral_icp.poses_differ(M, M, np.arange(len(M.X)))
     assert spectral_icp.poses_differ(M, N, cKDTree(M.X).query(N.X)[1])
 
 
-def test_of_first_maps_the_one_that_fits_is_taken(shapes):
+def test_of_initial_maps_the_best_is_chosen(shapes):
     low = shapes[0].low
     name, C, _ = initial_map.best_initial_map(low, low, np.diag((-1.0) ** np.arange(20)))
     assert name in ("hks", "wks")
     assert np.diag(C).min() > 0.9
 
 
-def test_a_search_goes_on_to_maps_of_signatures_and_curvature_until_one_fits(shapes, monkeypatch):
+def test_a_search_continues_with_signatures_and_curvature_until_a_map_fits(shapes, monkeypatch):
     low = shapes[0].low
     turned_over = np.diag((-1.0) ** np.arange(20))
     fit = initial_map.fmap.fmap_from_descriptors
@@ -163,8 +163,8 @@ def test_a_piece_that_is_not_connected_has_no_extremity(shapes):
 def test_extremities_are_paired_by_their_distances_whatever_the_order_of_the_vertices(shapes):
     low = shapes[0].low
     order = np.random.default_rng(0).permutation(len(low.X))
-    place = np.argsort(order)
-    other = replace(low, X=low.X[order], T=place[low.T], area=low.area[order])
+    rank = np.argsort(order)
+    other = replace(low, X=low.X[order], T=rank[low.T], area=low.area[order])
     a, b = initial_map.paired_extremities(low, other)[0]
     assert len(a) == initial_map.N_ENDS
     assert (order[b] == a).all()
@@ -182,7 +182,7 @@ def test_all_maps_of_a_search_carry_a_shape_to_itself(shapes):
         assert np.diag(C).min() > 0.9, name
 
 
-def test_the_network_of_an_analysis_starts_from_maps_that_no_pose_changes(bent):
+def test_the_initial_maps_of_an_analysis_do_not_depend_on_pose(bent):
     straight, other = bent
     study = analyse({"a": straight, "b": other}, n_coarse=1000, k=50, n_pairs=1, template="b")
     X = straight["position"].values
@@ -194,7 +194,7 @@ def test_the_network_of_an_analysis_starts_from_maps_that_no_pose_changes(bent):
     )
 
 
-def test_a_new_shape_in_another_pose_finds_its_place_in_a_study(bent):
+def test_a_new_shape_in_another_pose_is_registered_to_a_study(bent):
     straight, other = bent
     study = analyse(
         {"a": straight, "b": worm(2500, -0.1)}, n_coarse=1000, k=50, n_pairs=1, template="a"
@@ -218,7 +218,7 @@ def spheres(places, size, n=30):
 
 
 @pytest.mark.parametrize("k", [20, 30])
-def test_of_more_pieces_than_functions_the_first_map_is_that_of_nearest_neighbours(k):
+def test_with_more_components_than_functions_the_initial_map_is_that_of_nearest_neighbours(k):
     i = np.arange(25)
     source, target = (
         spheres(np.c_[3 * i, 0 * i, 0 * i], 1),
@@ -230,10 +230,10 @@ def test_of_more_pieces_than_functions_the_first_map_is_that_of_nearest_neighbou
 
 
 def test_pieces_of_one_function_each_move_as_a_whole():
-    low, apart = synthetic.sphere(30), np.repeat([0, 1], 30)
+    low, part = synthetic.sphere(30), np.repeat([0, 1], 30)
     X = np.concatenate([as_arrays(low)[0], as_arrays(low)[0] + 5])
-    R = np.stack([Rotation.from_rotvec(v).as_matrix() for v in ([0.3, 0, 0], [0, 0.5, 1])])[apart]
-    Phi = np.sqrt(2) * (apart[:, None] == [0, 1])
+    R = np.stack([Rotation.from_rotvec(v).as_matrix() for v in ([0.3, 0, 0], [0, 0.5, 1])])[part]
+    Phi = np.sqrt(2) * (part[:, None] == [0, 1])
     found, _ = deform.rigid_parts(
         X, np.einsum("nij,nj->ni", R, X), np.full(60, 1 / 60), Phi, np.zeros(2)
     )

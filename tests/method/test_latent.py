@@ -1,6 +1,6 @@
 """Consistent latent basis and Consistent ZoomOut (3.4).
 
-Exactly consistent maps are closed exactly.
+Exactly consistent maps have no cycle error.
 """
 
 import itertools
@@ -171,9 +171,7 @@ def test_consistent_zoomout_does_not_depend_on_the_workers_or_on_what_is_held(
         assert np.array_equal(a, c)
 
 
-def test_wide_rounds_look_between_the_samples_near_the_one_that_is_found(
-    shapes, first, monkeypatch
-):
+def test_dense_iterations_search_around_the_matched_sample(shapes, first, monkeypatch):
     samples = [Shape(coarse=shape).low.sample_vertices_of(150) for shape in shapes]  # of 600
 
     def maps(wide, n_around=latent.N_AROUND):
@@ -187,7 +185,7 @@ def test_wide_rounds_look_between_the_samples_near_the_one_that_is_found(
     assert np.abs(maps(2, n_around=600) - maps(2)).max() < 0.02  # 32 are nearly as good as all
 
 
-def test_consistent_zoomout_closes_cycles_better_than_the_first_maps(shapes, first):
+def test_consistent_zoomout_has_smaller_cycle_errors_than_the_initial_maps(shapes, first):
     cycles = network.three_cycles(*complete(3).tolist())
     _, _, error, _, _ = zoomed(shapes, first)
     C12 = zoomed(shapes, first)[0][:, :12, :12]
@@ -195,10 +193,10 @@ def test_consistent_zoomout_closes_cycles_better_than_the_first_maps(shapes, fir
     assert network.cycle_errors(C12, cycles).mean() < network.cycle_errors(first, cycles).mean()
 
 
-def test_progress_is_told_the_size_of_every_round(shapes, first):
-    told = []
-    zoomed(shapes, first, progress=told.append)
-    assert told == [12, 16, 20, 24, 25]
+def test_progress_is_called_with_the_size_of_every_iteration(shapes, first):
+    sizes = []
+    zoomed(shapes, first, progress=sizes.append)
+    assert sizes == [12, 16, 20, 24, 25]
 
 
 def test_maps_that_have_their_size_stay_as_they_are(maps, eigenvalues):

@@ -63,8 +63,8 @@ def test_the_conformal_difference_of_the_limit_shape_is_the_identity_but_for_the
     found = median.conformal_differences(three_shapes(), np.stack([EIGENVALUES] * 3), EIGENVALUES)
     assert found[0] == pytest.approx(np.diag([0, 1, 1]))
     assert found[1] == pytest.approx(np.diag([0, 4, 1]))
-    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
-    by_hand = np.diag([1 / 2, 1 / 4]) @ turn.T @ np.diag([2, 4]) @ turn
+    rotation = np.array([[0.8, -0.6], [0.6, 0.8]])
+    by_hand = np.diag([1 / 2, 1 / 4]) @ rotation.T @ np.diag([2, 4]) @ rotation
     assert found[2][1:, 1:] == pytest.approx(by_hand)
 
 

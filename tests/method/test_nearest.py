@@ -20,21 +20,21 @@ from s4a.method.nearest import (
 )
 
 
-def gaps(Q, D):
+def distances(Q, D):
     """All squared distances in float64."""
     return (Q**2).sum(1)[:, None] + (D**2).sum(1) - 2 * Q @ D.T
 
 
 def check(Q, D, found):
-    """Each row found is as near as the nearest one.
+    """Each result is as near as the nearest row.
 
     Up to float32 rounding of the squared distance.
     """
-    gap = gaps(Q, D)
+    distance = distances(Q, D)
     centred = np.concatenate([Q, D]) - D.mean(0)
     slack = 2e-6 * (centred**2).sum(1).max()
-    assert (gap[np.arange(len(Q)), found] <= gap.min(1) + slack).all()
-    return (found == gap.argmin(1)).mean()
+    assert (distance[np.arange(len(Q)), found] <= distance.min(1) + slack).all()
+    return (found == distance.argmin(1)).mean()
 
 
 def clustered(n, d, seed, spread=0.05):
@@ -69,7 +69,7 @@ def test_rows_far_from_the_origin_lose_nothing():
     (Q, cell_q), (D, cell_d) = clustered(2000, 20, 3), clustered(2000, 20, 4)
     far = np.full(20, 300.0)
     found, *_ = nearest_in_cells(Q + far, cell_q, D + far, cell_d)
-    assert (found == gaps(Q, D).argmin(1)).all()
+    assert (found == distances(Q, D).argmin(1)).all()
 
 
 def test_rows_that_are_nearly_the_same_are_found_across_cells():
@@ -131,8 +131,8 @@ def test_cells_hold_all_rows_within_their_radius():
     assert (np.sort(cells.order) == np.arange(500)).all()
     assert cells.rows == pytest.approx(D[cells.order], abs=1e-6)
     for c, (begin, end) in enumerate(zip(cells.start[:-1], cells.start[1:], strict=True)):
-        gap = np.linalg.norm(cells.rows[begin:end] - cells.center[c], axis=1)
-        assert gap.max() <= cells.radius[c] * (1 + 1e-5)
+        distance = np.linalg.norm(cells.rows[begin:end] - cells.center[c], axis=1)
+        assert distance.max() <= cells.radius[c] * (1 + 1e-5)
 
 
 @pytest.mark.parametrize("d", [1, 6, 50])
@@ -146,7 +146,7 @@ def test_few_queries_have_the_answer_of_an_exhaustive_search(d, block):
 
 def test_few_queries_among_clusters_far_from_the_origin_lose_nothing():
     (Q, _), (D, cell) = clustered(300, 20, 3), clustered(2000, 20, 4)
-    assert (nearest_of_few(Q + 300, D + 300, cell) == gaps(Q, D).argmin(1)).all()
+    assert (nearest_of_few(Q + 300, D + 300, cell) == distances(Q, D).argmin(1)).all()
 
 
 def test_few_queries_take_the_first_of_equally_near_rows():
@@ -159,12 +159,12 @@ def test_few_queries_take_the_first_of_equally_near_rows():
 def test_a_search_around_what_is_found_among_some_gives_nearly_what_is_nearest_of_all():
     X, _ = as_arrays(synthetic.ellipsoid(900))
     some = np.arange(0, 900, 6)  # spread: the vertices are a spiral
-    gap = np.linalg.norm(X[some, None] - X, axis=2)  # (some, n)
+    distance = np.linalg.norm(X[some, None] - X, axis=2)  # (some, n)
     q, d = as_queries(X + 0.01), as_candidates(X)
     exact = nearest_float32(q, d)
 
     def found(width):
-        around = np.argsort(gap, axis=1)[:, :width]
+        around = np.argsort(distance, axis=1)[:, :width]
         return nearest_around(q, d.T, around[nearest_float32(q, d[:, some])])
 
     assert np.array_equal(found(900), exact)
@@ -173,16 +173,16 @@ def test_a_search_around_what_is_found_among_some_gives_nearly_what_is_nearest_o
 
 
 @pytest.mark.parametrize(("n", "m"), [(600, 700), (1, 300), (300, 1), (256, 512)])
-def test_one_product_gives_the_nearest_both_ways(n, m):
+def test_one_product_gives_the_nearest_in_both_directions(n, m):
     rng = np.random.default_rng(n)
     A, B = rng.normal(size=(n, 20)) + 3, rng.normal(size=(m, 20)) * [[1], [4]][n % 2] + 3
     of_a, of_b = nearest_bidirectional(as_queries(A), as_candidates(B))
-    gap = np.linalg.norm(A[:, None] - B, axis=2)
-    assert np.array_equal(of_a, gap.argmin(1))
-    assert np.array_equal(of_b, gap.argmin(0))
+    distance = np.linalg.norm(A[:, None] - B, axis=2)
+    assert np.array_equal(of_a, distance.argmin(1))
+    assert np.array_equal(of_b, distance.argmin(0))
 
 
-def test_both_ways_take_the_first_of_rows_that_are_equally_near():
+def test_ties_in_both_directions_give_the_first_row():
     A = np.random.default_rng(5).integers(0, 3, (400, 3)).astype(float)
     of_a, of_b = nearest_bidirectional(as_queries(A), as_candidates(A))
     n_initial = (A[:, None] == A).all(2).argmax(1)

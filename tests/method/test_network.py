@@ -1,4 +1,4 @@
-"""The network of maps (3.4): which pairs, initial maps, cycles."""
+"""The network of maps (3.4): pairs, initial maps, cycles."""
 
 import itertools
 from dataclasses import replace
@@ -55,13 +55,13 @@ def test_every_shape_is_in_a_triangle_with_twice_as_many_pairs_as_shapes(n):
 
 
 def chosen_by_definition(distance, n_pairs):
-    """The pairs one by one, as :func:`network.choose_pairs` says in words."""
+    """Choose the pairs one by one by the definition in :func:`network.choose_pairs`."""
     n = len(distance)
     inside, edges, closing = [int(np.argmin(distance.sum(1)))], [], []
     while len(inside) < n:
-        ways = [(distance[i, j], j, i) for j in range(n) if j not in inside for i in inside]
-        least = min(ways)[0]
-        new = min(j for d, j, _ in ways if d == least)
+        options = [(distance[i, j], j, i) for j in range(n) if j not in inside for i in inside]
+        least = min(options)[0]
+        new = min(j for d, j, _ in options if d == least)
         parent = next(i for i in inside if distance[i, new] == least)
         around = sorted({j for edge in edges for j in edge if parent in edge} - {parent})
         if around:
@@ -111,7 +111,7 @@ def test_a_budget_that_cannot_connect_is_refused_with_the_range(budget):
         network.choose_pairs(distances(5), budget)
 
 
-def test_one_shape_is_no_network():
+def test_a_single_shape_is_not_a_network():
     with pytest.raises(ValueError, match="at least 2 shapes; found 1"):
         network.choose_pairs(np.zeros((1, 1)), 1)
 
@@ -128,7 +128,7 @@ def low(low_brain):
 
 
 @pytest.mark.parametrize("init", ["dense", "landmarks"])
-def test_the_first_map_of_a_shape_to_itself_moved_is_the_identity(low, init):
+def test_the_initial_map_of_a_shape_to_itself_moved_is_the_identity(low, init):
     R, t = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3])
     first = map_after_alignment(low, replace(low, X=low.X @ R.T + t), (R, t), k_init=20, init=init)
     assert pytest.approx(np.eye(20), abs=1e-9) == first.C
@@ -136,7 +136,7 @@ def test_the_first_map_of_a_shape_to_itself_moved_is_the_identity(low, init):
 
 @pytest.fixture(scope="module")
 def consistent():
-    """Maps C_ij = Y_j Y_i^-1 of four shapes, all pairs both ways."""
+    """Maps C_ij = Y_j Y_i^-1 of four shapes, all pairs in both directions."""
     Y = np.random.default_rng(0).normal(size=(4, 6, 6)) + 3 * np.eye(6)
     source, target = np.array(list(itertools.permutations(range(4), 2))).T
     return (
@@ -149,7 +149,7 @@ def consistent():
 def test_every_directed_cycle_is_found_once(consistent):
     _, source, target = consistent
     cycles = network.three_cycles(source.tolist(), target.tolist())
-    assert len(cycles) == 8  # 4 triangles, both ways round
+    assert len(cycles) == 8  # 4 triangles in two orientations
     assert len(np.unique(np.sort(cycles, axis=1), axis=0)) == 8
     for a, b, c in cycles:
         assert target[a] == source[b]

@@ -29,7 +29,7 @@ def paper(brains):
 
 @pytest.fixture(scope="module")
 def standard(brains):
-    """The study of the paper by the standard way, eq. 3 and 4, and the size taken out."""
+    """Study with the paper's standard dense match, eq. 3 and 4, and size removed."""
     return s4a.analyse(brains, preset="paper", dense_match="fmap", remove_size=True, **OPTIONS)
 
 
@@ -70,7 +70,7 @@ def stored(study, variable, name):
 
 
 def are_nearest(match, query, among):
-    """Whether no row is nearer than the matched one, but for the rounding of single precision."""
+    """Whether no row is closer than the matched one, up to single-precision rounding."""
     distance = cdist(query, among)
     return np.allclose(distance[np.arange(len(match)), match], distance.min(1), rtol=1e-4)
 
@@ -88,7 +88,7 @@ def test_the_landmarks_are_ten_and_their_partners_the_nearest_after_icp(paper):
         assert are_nearest(network["landmark_of_target"].values[p], moved, N)
 
 
-def test_the_step_ahead_is_one_match_and_back(paper):
+def test_the_initial_refinement_is_one_match_and_its_map(paper):
     network = paper["network"]
     for p, (i, j) in enumerate(
         zip(network["source"].values, network["target"].values, strict=True)
@@ -100,7 +100,7 @@ def test_the_step_ahead_is_one_match_and_back(paper):
         assert network["fmap_initial"].values[p] == pytest.approx(Psi.T @ A @ Phi[match], abs=1e-3)
 
 
-def test_every_round_of_consistent_zoomout_is_equation_3_and_a_larger_map(paper):
+def test_every_iteration_of_consistent_zoomout_is_equation_3_and_a_larger_map(paper):
     iterations = list(paper["iterations"].children.values())
     assert [node.sizes["eigenpair"] for node in iterations] == [10, 15, 20, 24]
     network = paper["network"]
@@ -156,9 +156,9 @@ def test_equation_3_holds_between_any_two_shapes_and_gives_their_map(paper):
     assert C == pytest.approx(np.linalg.lstsq(Y_i.T, Y_j.T)[0].T)
 
 
-@pytest.mark.parametrize("way", ["paper", "standard"])
-def test_the_match_of_equation_6_is_kept_however_full_resolution_is_reached(way, request):
-    study = request.getfixturevalue(way)
+@pytest.mark.parametrize("fixture", ["paper", "standard"])
+def test_the_match_of_equation_6_is_kept_however_full_resolution_is_reached(fixture, request):
+    study = request.getfixturevalue(fixture)
     template, names = others(study)
     Psi, _, Y_template = low(study, template)
     for name in names:
@@ -192,15 +192,15 @@ def test_the_standard_match_is_that_of_equation_4(standard):
         assert not are_nearest(match, query, projection(standard, name) @ (Phi @ C))
 
 
-@pytest.mark.parametrize("way", ["paper", "standard"])
-def test_the_displacement_is_that_of_equation_8_after_icp_alone(way, request):
-    study = request.getfixturevalue(way)
+@pytest.mark.parametrize("fixture", ["paper", "standard"])
+def test_the_displacement_is_that_of_equation_8_after_icp_alone(fixture, request):
+    study = request.getfixturevalue(fixture)
     template, names = others(study)
     X = study["original"][template]["position"].values
     center, size = frame(study, template)
     for name in names:
         own_center, own_size = frame(study, name)
-        s = size / own_size if way == "standard" else 1.0
+        s = size / own_size if fixture == "standard" else 1.0
         R = stored(study, "icp_rotation", name)
         image = study["original"][name]["position"].values[stored(study, "registered_match", name)]
         placed = s * (image - own_center) @ R.T + size * stored(study, "icp_translation", name)
@@ -210,9 +210,9 @@ def test_the_displacement_is_that_of_equation_8_after_icp_alone(way, request):
         assert stored(study, "scale", name) == pytest.approx(s)
 
 
-@pytest.mark.parametrize("way", ["paper", "standard"])
-def test_the_smooth_displacement_is_the_projection_as_printed(way, request):
-    study = request.getfixturevalue(way)
+@pytest.mark.parametrize("fixture", ["paper", "standard"])
+def test_the_smooth_displacement_is_the_projection_as_printed(fixture, request):
+    study = request.getfixturevalue(fixture)
     template, names = others(study)
     B = projection(study, template) @ low(study, template)[0]
     for name in names:

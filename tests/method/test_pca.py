@@ -1,6 +1,6 @@
-"""Principal modes (6.1): simulated modes come back with their variances.
+"""Modes of variation (6.1): simulated modes are recovered with their variances.
 
-Every shape is made again from its scores.
+Every shape is reconstructed from its scores.
 """
 
 import numpy as np
@@ -43,7 +43,7 @@ def modes(simulated):
     return pca.pca(simulated[0], simulated[1])
 
 
-def test_planted_modes_come_back_with_their_standard_deviations_and_shares(simulated, modes):
+def test_simulated_modes_come_back_with_their_standard_deviations_and_shares(simulated, modes):
     variance = DEVIATIONS**2
     assert modes["standard_deviation"].values[:3] == pytest.approx(DEVIATIONS, rel=1e-5)
     assert modes["explained_variance_ratio"].values[:3] == pytest.approx(
@@ -52,7 +52,7 @@ def test_planted_modes_come_back_with_their_standard_deviations_and_shares(simul
     assert modes["mean_displacement"].values == pytest.approx(simulated[4], abs=1e-5)
 
 
-def test_planted_scores_come_back(simulated, modes):
+def test_simulated_scores_come_back(simulated, modes):
     score, found = simulated[3], modes["score"].values[:, :3]
     assert np.abs(np.corrcoef(score.T, found.T)[:3, 3:]) == pytest.approx(np.eye(3), abs=1e-5)
     assert np.abs(found) == pytest.approx(np.abs(score), abs=1e-4)

@@ -54,7 +54,7 @@ def test_lifted_functions_are_eigenfunctions_of_the_mesh_where_projected_ones_ar
     assert off < 0.1 * coarse_off
 
 
-def test_lifted_functions_are_orthonormal_and_the_first_is_constant(shape, exact):
+def test_refined_eigenfunctions_are_orthonormal_and_the_first_is_constant(shape, exact):
     area = exact[2]
     _, B = with_refined_eigenfunctions(shape)
     assert np.allclose(B.T @ (area[:, None] * B), np.eye(K), atol=1e-4)

@@ -1,6 +1,6 @@
 """Registration at full resolution (eq. 4, 6, 7).
 
-Itself, a simulated deformation, invariance, the way back.
+The identity, a simulated deformation, invariance, closest template points.
 """
 
 import numpy as np
@@ -56,7 +56,7 @@ def true_displacement(template, deformed):
     return displacement_in_template(X, deformed["position"].values, vertex_areas(X, T))[0]
 
 
-def apart(found, other, size):
+def mean_difference(found, other, size):
     """Mean distance of two displacements, as a share of sqrt(area)."""
     return np.linalg.norm(found["displacement"].values - other, axis=1).mean() / size
 
@@ -72,15 +72,15 @@ def test_a_shape_registered_to_itself_does_not_move(template, size):
     assert found["fmap"].values == pytest.approx(np.eye(60), abs=1e-6)
 
 
-def test_a_planted_deformation_is_recovered_and_better_than_by_nearest_neighbours(
+def test_a_simulated_deformation_is_recovered_more_accurately_than_by_nearest_neighbours(
     pair, template, deformed, true_displacement, size
 ):
     true = deformed["position"].values
     near = cKDTree(true).query(template["position"].values)[1]
     nearest = np.linalg.norm(true[near] - true, axis=1).mean() / size
     assert nearest > 0.01
-    assert apart(pair, true_displacement, size) < 0.002
-    assert apart(pair, true_displacement, size) < nearest / 4
+    assert mean_difference(pair, true_displacement, size) < 0.002
+    assert mean_difference(pair, true_displacement, size) < nearest / 4
     assert (pair["match"].values == np.arange(5000)).mean() > 0.7
 
 
@@ -89,13 +89,13 @@ def test_the_displacement_brings_the_template_onto_the_matched_vertices(pair, te
     assert np.linalg.norm(smooth - raw, axis=1).mean() < 0.006 * size
 
 
-def test_the_paper_way_finds_a_correspondence_too_and_says_so(template, deformed, size):
+def test_the_algorithm_of_the_paper_finds_a_correspondence_and_is_named(template, deformed, size):
     found = match_pair(deformed, template, refine="intrinsic", init="landmarks", **OPTIONS)
     assert found.attrs["initialisation"] == "intrinsic"
     assert 0 < found.attrs["compared_share"] < 1
     assert 0 < found.attrs["certified_share"] <= 1
-    gap = deformed["position"].values[found["match"].values] - deformed["position"].values
-    assert np.linalg.norm(gap, axis=1).mean() < 0.03 * size
+    distance = deformed["position"].values[found["match"].values] - deformed["position"].values
+    assert np.linalg.norm(distance, axis=1).mean() < 0.03 * size
 
 
 @pytest.mark.parametrize("degrees", [10, 70, 170])
@@ -105,7 +105,7 @@ def test_the_displacement_does_not_depend_on_the_pose_of_the_source(
     X, T = as_arrays(deformed)
     R = Rotation.from_rotvec(degrees * np.array([0.6, 0, 0.8]), True).as_matrix()
     found = match_pair(clean(as_dataset(X @ R.T + 70, T)), template, **OPTIONS)
-    assert apart(found, true_displacement, size) < 0.003
+    assert mean_difference(found, true_displacement, size) < 0.003
 
 
 def test_the_result_does_not_depend_on_the_numbering_of_the_source(pair, template, deformed, size):
@@ -113,7 +113,7 @@ def test_the_result_does_not_depend_on_the_numbering_of_the_source(pair, templat
     order = np.random.default_rng(0).permutation(len(X))
     other = clean(as_dataset(X[order], np.argsort(order)[T]))
     found = match_pair(other, template, **OPTIONS)
-    assert apart(found, pair["displacement"].values, size) < 0.002
+    assert mean_difference(found, pair["displacement"].values, size) < 0.002
     vertex = order[other["file_vertex"].values][found["match"].values]
     assert (vertex == pair["match"].values).mean() > 0.7
 
@@ -124,7 +124,7 @@ def test_the_displacement_does_not_depend_on_the_numbering_of_the_template(
     X, T = as_arrays(template)
     order = np.random.default_rng(1).permutation(len(X))
     found = match_pair(deformed, as_dataset(X[order], np.argsort(order)[T]), **OPTIONS)
-    assert apart(found, true_displacement[order], size) < 0.003
+    assert mean_difference(found, true_displacement[order], size) < 0.003
 
 
 def test_a_thousandfold_unit_gives_a_thousandfold_displacement(pair, template, deformed, size):
@@ -136,7 +136,7 @@ def test_a_thousandfold_unit_gives_a_thousandfold_displacement(pair, template, d
         **OPTIONS,
     )
     found["displacement"] /= 1000
-    assert apart(found, pair["displacement"].values, size) < 0.002
+    assert mean_difference(found, pair["displacement"].values, size) < 0.002
     assert (found["match"].values == pair["match"].values).mean() > 0.7
 
 
@@ -149,7 +149,7 @@ def shapes(template, deformed):
     return [Shape(m, spectrum(coarsen(m, n_coarse=800), k=30)) for m in (deformed, template)]
 
 
-def test_the_way_back_reproduces_the_positions(shapes):
+def test_closest_template_points_reproduce_the_positions(shapes):
     source, target = shapes
     image = source.original["position"].values  # the template deformed exactly
     moved = target.full.moved_to(source.to_frame(image))
@@ -193,7 +193,7 @@ def test_the_template_is_registered_to_itself_by_definition(template):
     assert shape.frame[1] == pytest.approx(np.sqrt(vertex_areas(X, T).sum()))
 
 
-def test_size_can_be_taken_out_of_the_displacement(shapes):
+def test_size_can_be_removed_from_the_displacement(shapes):
     _, target = shapes
     X, T = as_arrays(target.original)
     grown = clean(as_dataset(1.2 * X, T))
@@ -260,5 +260,5 @@ def test_the_match_of_eq_6_is_kept_at_low_resolution_as_it_is(pair, deformed, te
         coarsen(m, n_coarse=2000)["position"].values for m in (template, deformed)
     )
     R, t = pair["rotation"].values, pair["translation"].values
-    gap = cKDTree(shape_low @ R.T + t).query(template_low + low)[0]
-    assert gap.max() < 1e-4 * size  # every one is at a vertex of the coarse shape
+    distance = cKDTree(shape_low @ R.T + t).query(template_low + low)[0]
+    assert distance.max() < 1e-4 * size  # every one is at a vertex of the coarse shape

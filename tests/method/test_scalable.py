@@ -79,7 +79,7 @@ def test_identical_shapes_give_the_identity():
     assert (nearest_in_cells(F, shape.cell, F @ C.T, shape.cell)[0] == np.arange(2000)).all()
 
 
-def test_the_result_does_not_depend_on_place_and_size():
+def test_the_result_does_not_depend_on_position_and_size():
     mesh = synthetic.ellipsoid(1500)
     moved = mesh.assign(position=mesh["position"] * 7.0 + 3.0)
     one, other = (reduce(m, n_samples=200, k=12).low for m in (mesh, moved))

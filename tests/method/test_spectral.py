@@ -14,7 +14,7 @@ SPHERE = np.repeat([0.0, 2.0, 6.0, 12.0], [1, 3, 5, 7]) * 4 * np.pi  # l (l + 1)
 
 
 def prepared(X, T):
-    """A mesh as `spectrum` takes it, without coarsening."""
+    """A mesh in the form that `spectrum` needs, without coarsening."""
     E, w = cotan_weights(X, T)
     return dataset(
         position=X, corner_vertex=T, vertex_area=vertex_areas(X, T), edge_vertex=E, cotan_weight=w

@@ -1,4 +1,4 @@
-"""Joint refinement and displacement (eq. 8): simulated deformations, and the score of a match."""
+"""Spectral ICP and displacement (eq. 8): simulated deformations, and the score of a match."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def moved(surface, X):
     return replace(surface, X=X)
 
 
-def test_the_joint_rounds_leave_the_identity_alone(surface):
+def test_spectral_icp_keeps_the_identity(surface):
     every = np.arange(len(surface.X))
     match, transform = spectral_icp.coarse_spectral_icp(surface, surface, every, k=60)
     assert (match == every).all()
@@ -41,7 +41,7 @@ def test_the_joint_rounds_leave_the_identity_alone(surface):
 
 
 @pytest.mark.parametrize("spectral_weight", [0.0, 0.1])
-def test_a_planted_deformation_is_recovered_and_far_better_than_by_nearest_neighbours(
+def test_a_simulated_deformation_is_recovered_far_more_accurately_than_by_nearest_neighbours(
     surface, spectral_weight
 ):
     source = moved(surface, surface.X + bumps(surface.X))
@@ -68,7 +68,7 @@ def test_a_rigid_motion_is_recovered_exactly_without_any_deformation(surface):
     assert np.abs(c).max() < 1e-9
 
 
-def test_the_dense_rounds_keep_a_planted_deformation_of_the_span(surface):
+def test_dense_spectral_icp_keeps_a_simulated_deformation_of_the_span(surface):
     c = np.zeros((60, 3))
     c[4:12] = np.random.default_rng(0).normal(0, 0.008, (8, 3))
     source = moved(surface, surface.X + surface.Phi @ c)
@@ -124,7 +124,7 @@ def test_smoothing_keeps_fields_of_the_span_and_is_a_projection(surface):
 
 
 @pytest.mark.parametrize("scale", [False, True])
-def test_the_displacement_in_the_template_is_image_minus_template_after_the_motion(scale):
+def test_the_displacement_in_the_template_is_image_minus_template_after_alignment(scale):
     rng = np.random.default_rng(4)
     X, area = rng.normal(size=(50, 3)), rng.uniform(0.5, 1, 50)
     R = Rotation.random(random_state=0).as_matrix()

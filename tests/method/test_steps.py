@@ -1,4 +1,4 @@
-"""The steps one by one are those of an analysis, and the formulas of the paper on stored arrays."""
+"""The separate steps equal those of an analysis, and the formulas of the paper on stored arrays."""
 
 import numpy as np
 import pytest
@@ -131,7 +131,7 @@ def test_sizes_that_do_not_fit_each_other_are_refused_by_name(study, coarse, opt
         s4a.refine_network(coarse, study["network"].to_dataset(), **{"k": 24} | options)
 
 
-def test_as_few_spread_vertices_as_are_allowed_refine_identical_shapes_to_the_identity(coarse):
+def test_the_smallest_number_of_samples_refines_identical_shapes_to_the_identity(coarse):
     same = dict.fromkeys("abc", coarse["brain_01"])
     first = s4a.build_network(same, k_init=10)
     for n_samples in (48, 0):
@@ -139,7 +139,7 @@ def test_as_few_spread_vertices_as_are_allowed_refine_identical_shapes_to_the_id
         assert np.abs(maps - np.eye(24)).max() < 1e-5
 
 
-def test_spread_vertices_are_enough_where_they_are_all_of_a_small_mesh(coarse):
+def test_all_vertices_of_a_small_mesh_are_enough_samples(coarse):
     small = {name: mesh.isel(eigenpair=slice(12)) for name, mesh in coarse.items()}
     first = s4a.build_network(small, k_init=10)
     assert s4a.refine_network(small, first, k=100, n_samples=50)["network/fmap"].shape[1:] == (
@@ -151,7 +151,7 @@ def test_spread_vertices_are_enough_where_they_are_all_of_a_small_mesh(coarse):
     s4a.refine_network(coarse, first, k=k, n_samples=every)
 
 
-def test_options_refuse_spread_vertices_too_few_for_k_and_no_preset_of_their_own():
+def test_options_refuse_too_few_samples_for_k_but_presets_do_not():
     with pytest.raises(
         ValueError, match="n_samples must be 0, for all vertices, or at least 200, f"
     ):

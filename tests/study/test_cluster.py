@@ -43,9 +43,9 @@ def test_two_dask_workers_give_the_bits_of_a_local_run(brain_files, study_of_fil
     assert_the_same(tmp_path / "study", study_of_files)
 
 
-def wait_for(found, what, seconds=120):
+def wait_for(result, what, seconds=120):
     end = time.monotonic() + seconds
-    while not found():
+    while not result():
         assert time.monotonic() < end, f"no {what} in {seconds} s"
         time.sleep(0.02)
 
@@ -99,11 +99,11 @@ def test_a_worker_killed_in_the_middle_costs_only_its_task(brain_files, study_of
     again = [path for path, time in done.items() if path.stat().st_mtime_ns != time]
     assert (
         len(again) <= 1
-    )  # the task of the dead worker may have been written, but not yet told to the scheduler
+    )  # the task of the dead worker may have been written, but not yet reported to the scheduler
 
 
 @pytest.mark.parametrize("address", ["nowhere", "local:", "local:0", "local:two"])
-def test_an_address_that_is_none_says_what_is_needed(address, capsys, tmp_path):
+def test_an_invalid_address_is_an_error_that_says_what_is_needed(address, capsys, tmp_path):
     pytest.importorskip("distributed")
     assert (
         cli.main(["run", str(tmp_path), "--out", str(tmp_path / "study"), "--cluster", address])

@@ -11,7 +11,7 @@ from s4a.method.shape import Shape, common_fields
 
 
 def egg(twist=0.0, n=1500):
-    """An ellipsoid that is twisted within its own surface, and a field that goes along."""
+    """An ellipsoid that is twisted within its surface, and a field that follows the twist."""
     axes = np.array([1.0, 1.3, 2.0])
     X, T = as_arrays(s4a.synthetic.ellipsoid(n, axes))
     u = X / axes
@@ -21,13 +21,13 @@ def egg(twist=0.0, n=1500):
     return s4a.clean(as_dataset(u * axes, T)), field, u * axes
 
 
-def image_of(found, template):
-    moved = template["position"].values + found["displacement"].values
-    return (moved - found["translation"].values) @ found["rotation"].values / found["scale"].item()
+def image_of(result, template):
+    moved = (template["position"] + result["displacement"] - result["translation"]).values
+    return moved @ result["rotation"].values / result["scale"].item()
 
 
-def error(found, template, true):
-    return np.linalg.norm(image_of(found, template) - true, axis=1).mean()
+def error(result, template, true):
+    return np.linalg.norm(image_of(result, template) - true, axis=1).mean()
 
 
 def test_a_field_tells_what_the_surface_does_not():
@@ -53,7 +53,7 @@ def test_a_field_is_standard_at_both_resolutions_and_unknown_values_count_as_the
     mesh = s4a.with_features(mesh, {"depth": values, "flat": np.ones(len(f))})
     shape = Shape(mesh, low_resolution(mesh, n_coarse=300, k=10))
     for basis in (shape.full, shape.low):
-        assert list(basis.fields) == ["depth"]  # what is the same everywhere says nothing
+        assert list(basis.fields) == ["depth"]  # constant fields are ignored
         one = basis.fields["depth"]
         assert abs(basis.area @ one) < 0.1
         assert 0.6 < basis.area @ one**2 < 1.05
@@ -61,7 +61,7 @@ def test_a_field_is_standard_at_both_resolutions_and_unknown_values_count_as_the
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "text"),
     [
         ({}, "a field at least"),
         ({"a": np.ones(3)}, "a number for each of the 1500 vertices"),
@@ -70,15 +70,15 @@ def test_a_field_is_standard_at_both_resolutions_and_unknown_values_count_as_the
         ({"a": "nowhere.npy"}, "nowhere.npy"),
     ],
 )
-def test_a_field_that_does_not_fit_is_refused(given, said):
+def test_a_field_that_does_not_fit_is_refused(given, text):
     mesh, _, _ = egg()
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=text):
         s4a.with_features(mesh, given)
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Four brains as files, three of them with a file of a field beside."""
+    """Four brains as files, three of them with a file of a field."""
     folder = tmp_path_factory.mktemp("files")
     tree = s4a.synthetic.brains(4, 1500, seed=1)
     for path in s4a.synthetic.write(tree, folder)[:3]:
@@ -87,7 +87,7 @@ def files(tmp_path_factory):
     return folder
 
 
-def test_a_study_reads_fields_beside_its_files_and_says_who_has_none(files, tmp_path):
+def test_a_study_reads_fields_next_to_its_files_and_names_shapes_without(files, tmp_path):
     study = s4a.analyse(files, pattern="brain*.ply", features=["height"], store=tmp_path, **OPTIONS)
     having = [n for n, mesh in study["original"].children.items() if "feature_value" in mesh]
     assert len(having) == 3
@@ -119,9 +119,9 @@ def test_a_new_mesh_with_a_wrong_field_is_left_out_alone(files, tmp_path):
     np.save(tmp_path / "wrong.height.npy", height[:-1])
     new = s4a.insert(study, tmp_path)
     assert list(new["coarse"].children) == ["right"]
-    said = new["report"].to_dataset().sel(shape="wrong")
-    assert said["status"].item() == "excluded"
-    assert "height" in said["reason"].item()
+    text = new["report"].to_dataset().sel(shape="wrong")
+    assert text["status"].item() == "excluded"
+    assert "height" in text["reason"].item()
 
 
 def test_a_field_that_no_file_has_is_an_error(files):

@@ -1,6 +1,6 @@
 """New shapes in a finished study.
 
-Against the truth and a full recomputation, independent, the others kept.
+Compared with the ground truth and a full recomputation; the study is not changed.
 """
 
 import numpy as np
@@ -38,7 +38,7 @@ def inserted(study, meshes):
 
 
 def errors(tree, study, shape):
-    """Distances of the registered template to the truth on one shape, as shares of sqrt(area)."""
+    """Errors of the registered template on one shape, as shares of sqrt(area)."""
     data = study["registration"].to_dataset()
     u = tree["truth"][data.attrs["template"]]["reference_point"].values
     one = data.sel(shape=shape)
@@ -68,8 +68,8 @@ def test_a_new_shape_is_close_to_what_a_full_recomputation_gives(meshes, study, 
     d = full["registration"]["displacement"].sel(shape=["brain_07"]).values
     again, _ = project_scores(d, *modes, area)
     assert inserted["pca"]["score"].values[0, :2] == pytest.approx(again[0, :2], abs=0.25)
-    gap = np.linalg.norm(inserted["registration"]["displacement"].values - d, axis=2)[0]
-    assert gap.mean() < 0.006 * np.sqrt(area.sum())
+    distance = np.linalg.norm(inserted["registration"]["displacement"].values - d, axis=2)[0]
+    assert distance.mean() < 0.006 * np.sqrt(area.sum())
     assert inserted["latent"]["distance_to_limit"].item() == pytest.approx(
         full["latent"]["distance_to_limit"].sel(shape="brain_07").item(), rel=0.6
     )
@@ -95,9 +95,9 @@ def test_the_study_stays_as_it_is_and_the_result_does_not_depend_on_other_new_sh
 def test_a_shape_of_the_study_gets_its_own_scores_back(study, meshes):
     template = study["registration"].attrs["template"]
     name = next(n for n in meshes if n not in (template, "brain_07"))
-    found = insert(study, {"copy": meshes[name]})
-    assert found["report"]["flag_kinds"].item() == "duplicate"
-    assert found["pca"]["score"].values[0, :2] == pytest.approx(
+    result = insert(study, {"copy": meshes[name]})
+    assert result["report"]["flag_kinds"].item() == "duplicate"
+    assert result["pca"]["score"].values[0, :2] == pytest.approx(
         study["pca"]["score"].sel(shape=name).values[:2], abs=0.25
     )
 
@@ -120,23 +120,23 @@ def test_labels_travel_from_the_template_and_from_an_external_mesh_to_new_shapes
         near = cKDTree(other["position"]).query(meshes[name]["position"])[1]
         nearest = (other["label"].values[near] == meshes[name]["label"].values).mean()
         assert (node["label"].values == meshes[name]["label"].values).mean() > max(0.8, nearest)
-    place = transfer_landmarks(
+    path_inside = transfer_landmarks(
         study, other[["landmark_name", "landmark_position"]], source=other, targets=["brain_02"]
     )
-    gap = (
-        place["brain_02"]["landmark_position"].values
+    distance = (
+        path_inside["brain_02"]["landmark_position"].values
         - meshes["brain_02"]["landmark_position"].values
     )
-    assert np.linalg.norm(gap, axis=1).mean() < 5  # mm
+    assert np.linalg.norm(distance, axis=1).mean() < 5  # mm
 
 
 def test_a_shape_that_cannot_be_used_is_excluded_and_does_not_stop_the_others(study, meshes):
     tetrahedron = as_dataset(
         [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
     )
-    found = insert(study, {"small": tetrahedron, "brain_07": meshes["brain_07"]})
-    assert found["registration"]["shape"].values.tolist() == ["brain_07"]
-    assert found["report"]["status"].sel(shape="small").item() == "excluded"
+    result = insert(study, {"small": tetrahedron, "brain_07": meshes["brain_07"]})
+    assert result["registration"]["shape"].values.tolist() == ["brain_07"]
+    assert result["report"]["status"].sel(shape="small").item() == "excluded"
     with pytest.raises(ValueError, match=r"no shape can be inserted \(small: "):
         insert(study, {"small": tetrahedron})
 
@@ -164,6 +164,6 @@ def test_scores_on_the_modes_that_made_them_are_the_scores():
     rng = np.random.default_rng(1)
     d, area = rng.normal(size=(5, 40, 3)), rng.uniform(1, 2, 40)
     mean, deformation, deviation, score, _ = gram_pca(d, area)
-    found, left = project_scores(d, mean, deformation, deviation, area)
-    assert found == pytest.approx(score)
+    result, left = project_scores(d, mean, deformation, deviation, area)
+    assert result == pytest.approx(score)
     assert left == pytest.approx(0, abs=1e-6)

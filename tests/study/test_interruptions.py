@@ -91,9 +91,7 @@ def remains(pid):
         (signal.SIGHUP, os.killpg),  # as when a terminal is closed
     ],
 )
-def test_workers_are_gone_within_seconds_of_the_end_of_a_run_and_leave_nothing(
-    files, tmp_path, how, who, n_files
-):
+def test_workers_end_within_seconds_of_a_run_and_leave_nothing(files, tmp_path, how, who, n_files):
     with running(tmp_path / "study", files[:2], n_files) as (run, started):
         who(run.pid, how)
         run.wait(timeout=20)
@@ -128,9 +126,7 @@ def test_an_interruption_that_gets_lost_ends_the_run_after_the_task(files, tmp_p
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_run_killed_with_its_workers_goes_on_and_the_next_one_removes_what_they_left(
-    files, tmp_path
-):
+def test_a_run_killed_with_its_workers_resumes_and_removes_their_files(files, tmp_path):
     folder, files = tmp_path / "study", files[:2]
     with running(folder, files, 4) as (run, _):
         os.killpg(run.pid, signal.SIGKILL)
@@ -155,7 +151,7 @@ def test_temporary_studies_of_killed_runs_are_removed_and_those_of_others_stay(
         (tmp_path / name).mkdir()
     for name in ("s4a-abandond", "s4a-of_other"):
         (tmp_path / name / ".lock").write_text("")
-    with processes.held(tmp_path / "s4a-of_other"), processes.temporary_folder() as folder:
+    with processes.locked(tmp_path / "s4a-of_other"), processes.temporary_folder() as folder:
         assert folder.parent == tmp_path
         left = {path.name for path in tmp_path.iterdir()}
         assert left == {"s4a-of_other", "s4a-begin_ng", "s4a-thoughts", folder.name}
@@ -222,22 +218,23 @@ def test_a_run_killed_in_every_stage_ends_with_the_same_study(files, whole, tmp_
         *flags,
     ]
     subprocess.run(script, check=True, capture_output=True)
-    told = (tmp_path / "log").read_text().splitlines()
-    assert [line for line in told if line[:6] == "killed"] == [f"killed {file}" for file in KILLS]
-    found = contents(tmp_path / "study")
+    messages = (tmp_path / "log").read_text().splitlines()
+    killed = [line for line in messages if line[:6] == "killed"]
+    assert killed == [f"killed {file}" for file in KILLS]
+    result = contents(tmp_path / "study")
     shared = {
         "network.nc",
         "registration.nc",
         "pca.nc",
-    }  # of two files or none a task: made again, and the same
-    for file in set(found) - shared:
-        assert told.count(f"written {file}") == 1, file
+    }  # tasks of two files or none: computed again, with the same result
+    for file in set(result) - shared:
+        assert messages.count(f"written {file}") == 1, file
     assert not list((tmp_path / "study").rglob(".*.tmp"))
     assert_the_same(tmp_path / "study", whole)
 
 
 def contents(folder):
-    """Every file of a study, without what the clock says."""
+    """Every file of a study, without times."""
     files = {
         path.relative_to(folder).as_posix(): netcdf.read(path) for path in folder.rglob("[!.]*.nc")
     }
@@ -256,10 +253,10 @@ def whole(files, tmp_path_factory):
 
 
 def assert_the_same(folder, whole):
-    found = contents(folder)
-    assert sorted(found) == sorted(whole)
+    result = contents(folder)
+    assert sorted(result) == sorted(whole)
     for file, data in whole.items():
-        assert data.identical(found[file]), file
+        assert data.identical(result[file]), file
 
 
 def test_a_disk_that_is_full_in_every_stage_keeps_what_is_finished(
@@ -283,7 +280,7 @@ def test_a_disk_that_is_full_in_every_stage_keeps_what_is_finished(
     assert not list(folder.glob(".log/**/*.txt"))
 
 
-def test_files_that_vanish_or_change_while_they_are_read_end_the_run_which_then_goes_on(
+def test_files_that_disappear_or_change_while_read_end_the_run_which_then_resumes(
     files, whole, tmp_path, monkeypatch
 ):
     folder, meshes = tmp_path / "study", tmp_path / "meshes"
@@ -309,7 +306,7 @@ def test_files_that_vanish_or_change_while_they_are_read_end_the_run_which_then_
     for happens in (change, remove):
         restore()
         monkeypatch.setattr(tasks, "read_shape", happens)
-        with pytest.raises(OSError, match=r"brain_02\.ply has changed or gone since the run began"):
+        with pytest.raises(OSError, match=r"brain_02\.ply changed or disappeared"):
             analyse(meshes / "*.ply", store=folder, intersections=False, **OPTIONS)
         assert not (folder / "original" / "brain_02.nc").exists()
     restore()
@@ -329,12 +326,12 @@ def test_a_folder_that_vanishes_ends_a_run_until_it_is_read_and_is_not_missed_in
     replace, content = os.replace, sources.content_of_file
     vanish_at = []
 
-    def vanish(place):
-        if vanish_at == [place]:
+    def vanish(position):
+        if vanish_at == [position]:
             meshes.rename(away)
             vanish_at.clear()
 
-    def looked_at(path):  # before the first stage
+    def checked_folder(path):  # before the first stage
         vanish(Path(path).name)
         return content(path)
 
@@ -342,10 +339,10 @@ def test_a_folder_that_vanishes_ends_a_run_until_it_is_read_and_is_not_missed_in
         replace(temporary, path)
         vanish(Path(path).relative_to(folder).as_posix())
 
-    monkeypatch.setattr(sources, "content_of_file", looked_at)
+    monkeypatch.setattr(sources, "content_of_file", checked_folder)
     monkeypatch.setattr(os, "replace", renamed)
-    for place in ("brain_02.ply", "original/brain_02.nc"):
-        vanish_at.append(place)
+    for position in ("brain_02.ply", "original/brain_02.nc"):
+        vanish_at.append(position)
         with pytest.raises(OSError, match=r"brain_0.\.ply has .*gone since the run began"):
             analyse(meshes, **options)
         away.rename(meshes)
@@ -362,10 +359,10 @@ def test_a_folder_that_vanishes_ends_a_run_until_it_is_read_and_is_not_missed_in
 
 def assert_equal_but_paths(folder, whole):
     """The files of a study are those of another whose meshes were elsewhere."""
-    found = contents(folder)
-    assert sorted(found) == sorted(whole)
+    result = contents(folder)
+    assert sorted(result) == sorted(whole)
     for file in set(whole) - {"report.nc"}:
-        assert found[file].equals(whole[file]), file
+        assert result[file].equals(whole[file]), file
 
 
 @pytest.mark.parametrize(
@@ -378,7 +375,7 @@ def assert_equal_but_paths(folder, whole):
         (KeyError("k"), "register_shape"),
     ],
 )
-def test_an_error_in_the_task_of_one_shape_costs_that_shape_and_is_told(
+def test_an_error_in_the_task_of_a_shape_excludes_the_shape_with_a_warning(
     files, tmp_path, monkeypatch, capsys, error, stage
 ):
     module = {"compare_shape": quality_control}.get(stage, pipeline)
@@ -392,7 +389,7 @@ def test_an_error_in_the_task_of_one_shape_costs_that_shape_and_is_told(
     monkeypatch.setattr(module, stage, wrong)
     folder = tmp_path / "study"
     assert cli.main(["run", *map(str, files), "--out", str(folder), *FLAGS]) == 1
-    said = capsys.readouterr().out
+    expected_text = capsys.readouterr().out
     with open_study(folder) as tree:
         report = tree["report"].to_dataset()
         assert report["status"].values.tolist()[1] == "excluded"
@@ -400,7 +397,7 @@ def test_an_error_in_the_task_of_one_shape_costs_that_shape_and_is_told(
         assert type(error).__name__ in reason
         assert "\n" not in reason
         assert tree["registration"]["shape"].values.tolist() == ["brain_01", "brain_03"]
-    assert type(error).__name__ in said
+    assert type(error).__name__ in expected_text
     log = folder / re.search(r"see (\S+\.txt) in the folder of the study", reason)[1]
     assert log.read_text().startswith("Traceback")
     assert "in wrong" in log.read_text()
@@ -435,22 +432,22 @@ def test_an_error_in_a_stage_of_all_shapes_ends_the_run_in_one_line_and_keeps_wh
 
 def test_a_crash_costs_the_shape_whose_processes_die_twice_and_nobody_else(files, whole, tmp_path):
     folder = tmp_path / "study"
-    found = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", CRASH, str(folder), *map(str, files)],
         capture_output=True,
         text=True,
         check=False,
     )
-    assert found.returncode == 0, found.stderr
+    assert result.returncode == 0, result.stderr
     with open_study(folder) as tree:
         report = tree["report"].to_dataset()
         assert (report["status"] == "excluded").values.tolist() == [False, True, False]
         reason = report["reason"].values[1]
         assert reason.startswith("registration: its process died (SIGSEGV: a fault in native code)")
         assert tree["report"].attrs["unforeseen"] == "brain_02"
-    told = (folder / ".log" / "registration-brain_02.txt").read_text()
-    assert told.count("begun by process") == 1
-    assert "in crash" in told
+    messages = (folder / ".log" / "registration-brain_02.txt").read_text()
+    assert messages.count("begun by process") == 1
+    assert "in crash" in messages
     kept = {file for file in whole if "registration" not in file and "/" in file}
     assert all(netcdf.read(folder / file).identical(whole[file]) for file in kept)
 
@@ -485,7 +482,7 @@ def test_a_worker_of_a_run_that_is_over_writes_nothing(tmp_path):
     with store.lock(tmp_path) as old:
         store.write(synthetic.sphere(50), tmp_path / "a.nc", "key", claim=old)
     with store.lock(tmp_path) as new:
-        with pytest.raises(ValueError, match=f"the run of process {os.getpid()} no longer holds"):
+        with pytest.raises(ValueError, match=f"process {os.getpid()} no longer has the lock"):
             store.write(synthetic.sphere(60), tmp_path / "a.nc", "key", claim=old)
         assert netcdf.read(tmp_path / "a.nc").sizes["vertex"] == 50
         store.write(synthetic.sphere(60), tmp_path / "a.nc", "key", claim=new)
@@ -543,17 +540,15 @@ sys.exit(cli.main(["run", *sys.argv[3:], "--out", sys.argv[2], *small]))
 
 
 @pytest.mark.parametrize("n_jobs", [1, 2])
-def test_a_disk_that_takes_no_more_ends_in_one_error_and_leaves_whole_files(
-    files, tmp_path, n_jobs
-):
+def test_a_full_disk_is_one_error_and_leaves_complete_files(files, tmp_path, n_jobs):
     folder = tmp_path / "study"
     arguments = [sys.executable, "-c", FULL, str(n_jobs), str(folder), *map(str, files[:2])]
-    found = subprocess.run(arguments, capture_output=True, text=True, check=False)
-    assert found.returncode == 2, found.stderr
-    lines = [line for line in found.stderr.splitlines() if line.startswith("s4a: ")]
-    assert len(lines) == 1, found.stderr
+    result = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert result.returncode == 2, result.stderr
+    lines = [line for line in result.stderr.splitlines() if line.startswith("s4a: ")]
+    assert len(lines) == 1, result.stderr
     assert "cannot be written" in lines[0]
-    assert "goes on where it stopped" in lines[0]
+    assert "resumes the run" in lines[0]
     whole = sorted(folder.rglob("[!.]*.nc"))
     assert whole
     assert all(netcdf.attributes(path)["task_key"] for path in whole)
@@ -586,8 +581,8 @@ def test_a_folder_that_cannot_be_written_is_one_error(tmp_path, monkeypatch):
 def test_names_that_lead_out_of_a_study_are_refused(tmp_path):
     folder = tmp_path / "study"
     (folder / "original").mkdir(parents=True)
-    found = dataset(latent_eigenvalue=[0.0, 1.0]).assign_coords(shape=["a", "../../outside"])
-    store.write(found.assign_attrs(median="a"), folder / "latent.nc")
+    result = dataset(latent_eigenvalue=[0.0, 1.0]).assign_coords(shape=["a", "../../outside"])
+    store.write(result.assign_attrs(median="a"), folder / "latent.nc")
     message = r"latent.nc cannot be read \(shapes need names of letters.*'../../outside'"
     with pytest.raises(OSError, match=message):
         open_study(folder)

@@ -1,4 +1,4 @@
-"""A few of the kills of ``benchmarks/kills.py``, so that it is known to run."""
+"""A few of the kills of ``benchmarks/kills.py``, as a test that it runs."""
 
 import subprocess
 import sys
@@ -8,6 +8,6 @@ from paths import BENCHMARKS
 
 def test_runs_killed_at_random_go_on_bit_for_bit_and_leave_nothing():
     bench = [sys.executable, BENCHMARKS / "kills.py", "--kills", "2", "--dask", "0"]
-    found = subprocess.run(bench, capture_output=True, text=True, check=False)
-    assert found.returncode == 0, found.stdout + found.stderr
-    assert "0 studies differ; left behind: nothing" in found.stdout
+    result = subprocess.run(bench, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "0 studies differ; left behind: nothing" in result.stdout

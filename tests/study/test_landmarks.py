@@ -1,4 +1,4 @@
-"""Landmarks of the user: what they pull, what they decide, and what is said of wrong ones."""
+"""Landmarks of the user: their effect on the registration, and errors for wrong ones."""
 
 import logging
 import subprocess
@@ -38,10 +38,10 @@ def points(positions, names="abcdefghij"):
     return dataset(landmark_name=list(names[: len(positions)]), landmark_position=positions)
 
 
-def image(found, template):
+def image(result, template):
     """The registered template, in the unit of the source."""
-    moved = template["position"].values + found["displacement"].values - found["translation"].values
-    return moved @ found["rotation"].values / found["scale"].item()
+    moved = (template["position"] + result["displacement"] - result["translation"]).values
+    return moved @ result["rotation"].values / result["scale"].item()
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_a_landmark_that_contradicts_the_surfaces_pulls_the_registration_where_i
     moved = on_shape.copy()
     moved[2] = X[np.argmin(abs(away - 0.05 * np.ptp(X)))]  # a twentieth of its length aside
     options = {"n_coarse": 800, "k": 40}
-    gaps = {}
+    distances = {}
     for what, target in (("none", None), ("true", on_shape), ("moved", moved)):
         pair = [template, shape]
         if target is not None:
@@ -71,15 +71,15 @@ def test_a_landmark_that_contradicts_the_surfaces_pulls_the_registration_where_i
                 with_landmarks(mesh, points(where))
                 for mesh, where in ((template, on_template), (shape, target))
             ]
-        found = match_pair(pair[1], pair[0], **options)
+        result = match_pair(pair[1], pair[0], **options)
         marked = with_landmarks(template, points(on_template))
-        place = marked["guide_triangle"].values, marked["guide_barycentric"].values
-        at = interpolate(image(found, template), as_arrays(template)[1], *place)
-        gaps[what] = np.linalg.norm(at - moved, axis=1), np.linalg.norm(at - on_shape, axis=1)
-    assert gaps["moved"][0][2] < 0.75 * gaps["none"][0][2]  # drawn to where it was put
+        point = marked["guide_triangle"].values, marked["guide_barycentric"].values
+        at = interpolate(image(result, template), as_arrays(template)[1], *point)
+        distances[what] = np.linalg.norm(at - moved, axis=1), np.linalg.norm(at - on_shape, axis=1)
+    assert distances["moved"][0][2] < 0.75 * distances["none"][0][2]  # drawn to where it was put
     others = [0, 1, 3, 4]
-    assert gaps["moved"][1][others].max() < 0.02 * np.ptp(X)  # and only there
-    assert gaps["true"][1].max() <= gaps["none"][1].max() + 1e-3 * size
+    assert distances["moved"][1][others].max() < 0.02 * np.ptp(X)  # and only there
+    assert distances["true"][1].max() <= distances["none"][1].max() + 1e-3 * size
 
 
 def test_shapes_without_common_names_are_registered_as_without_landmarks(brains):
@@ -104,7 +104,7 @@ def test_three_landmarks_say_how_a_shape_lies_that_its_form_does_not_tell(n):
         for P in (there, there @ turn.T)
     ]
     R, _ = transform_onto(*lows)
-    # an ellipsoid lies on itself after each half turn; as it lies, by its form alone
+    # an ellipsoid coincides with itself after each half turn
     assert np.allclose(R, turn if n == 3 else np.eye(3), atol=0.15)
 
 
@@ -136,8 +136,8 @@ def test_names_that_are_there_twice_are_refused_and_points_of_curves_left_out(br
 def test_a_folder_of_landmarks_is_read_by_the_names_of_shapes(tmp_path):
     for name in ("head.mrk.json", "arm.landmarks.csv", "Knie 3.csv", "table.txt", "other.pp"):
         (tmp_path / name).write_text("")
-    found = files_named(tmp_path, ["head", "arm", "Knie_3", "leg"], "landmarks", SUFFIXES)
-    assert {name: file.name for name, file in found.items()} == {
+    result = files_named(tmp_path, ["head", "arm", "Knie_3", "leg"], "landmarks", SUFFIXES)
+    assert {name: file.name for name, file in result.items()} == {
         "head": "head.mrk.json",
         "arm": "arm.landmarks.csv",
         "Knie_3": "Knie 3.csv",
@@ -176,11 +176,11 @@ def test_a_study_keeps_its_landmarks_and_says_who_has_none(marked, tmp_path):
     spacing = np.sqrt(coarse["vertex_area"].values.sum() / coarse.sizes["vertex"])
     away = np.linalg.norm(near - study["original/brain_01"]["guide_position"].values, axis=1)
     assert away.max() < 2 * spacing
-    assert "1 of 4 shapes have no file of landmarks" in study["report"].attrs["remarks"]
+    assert "1 of 4 shapes have no landmark file" in study["report"].attrs["remarks"]
     assert "brain_04" in study["report"].attrs["remarks"]
 
 
-def test_a_file_of_landmarks_that_changes_makes_its_shape_anew_and_no_other(marked, tmp_path):
+def test_a_changed_landmark_file_recomputes_its_shape_only(marked, tmp_path):
     meshes, folder = marked
     own = tmp_path / "marks"
     own.mkdir()
@@ -213,8 +213,8 @@ def test_landmarks_of_a_mirrored_shape_lie_where_they_lay(marked):
     meshes, folder = marked
     mesh = with_landmarks(meshes["brain_01"], folder / "brain_01.csv")
     image = mirror_image(mesh)
-    place = image["guide_triangle"].values, image["guide_barycentric"].values
-    np.testing.assert_allclose(interpolate(*as_arrays(image), *place), image["guide_position"])
+    point = image["guide_triangle"].values, image["guide_barycentric"].values
+    np.testing.assert_allclose(interpolate(*as_arrays(image), *point), image["guide_position"])
     np.testing.assert_allclose(image["guide_position"], mesh["guide_position"] * [-1, 1, 1])
 
 
@@ -234,7 +234,7 @@ def test_the_command_line_takes_them_for_a_study_and_for_new_shapes(marked, tmp_
     files = sorted((tmp_path / "scans").glob("*.ply"))
     arguments = ["run", *map(str, files[1:]), "--landmarks", str(folder)]
     assert cli.main([*arguments, "--out", str(tmp_path / "study"), *FLAGS]) == 0
-    assert "no file of landmarks" in capsys.readouterr().out
+    assert "no landmark file" in capsys.readouterr().out
     arguments = ["insert", str(tmp_path / "study"), str(files[0]), "--landmarks", str(folder)]
     assert cli.main([*arguments, "--out", str(tmp_path / "new")]) == 0
     study = open_study(tmp_path / "study")
@@ -251,8 +251,8 @@ def test_five_landmarks_decide_a_pair_of_bodies_that_fails_without(tmp_path):
     for i in (18, 2):
         mesh = read_shape(tmp_path / "faust" / f"tr_reg_{i:03d}.ply")
         pair.append(with_landmarks(mesh, points(mesh["position"].values[vertex])))
-    found = match_pair(*pair, n_coarse=2000, k=60)
+    result = match_pair(*pair, n_coarse=2000, k=60)
     X = pair[0]["position"].values
-    error = np.linalg.norm(X[found["match"].values] - X, axis=1).mean()
-    assert found.attrs["initial_map"] == "marked"
+    error = np.linalg.norm(X[result["match"].values] - X, axis=1).mean()
+    assert result.attrs["initial_map"] == "marked"
     assert error < 0.02 * np.sqrt(pair[0].attrs["area"])

@@ -1,4 +1,4 @@
-"""A pair registered on its own: what it takes of the machine."""
+"""Pairwise registration: use of threads."""
 
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -11,10 +11,10 @@ def blas_threads():
 
 
 def test_a_pair_takes_one_thread_of_blas_and_gives_back_the_others(monkeypatch):
-    seen, match_shapes = [], pair.match_shapes
+    calls, match_shapes = [], pair.match_shapes
 
     def watched(*given):
-        seen.extend(blas_threads())
+        calls.extend(blas_threads())
         return match_shapes(*given)
 
     monkeypatch.setattr(pair, "match_shapes", watched)
@@ -23,6 +23,6 @@ def test_a_pair_takes_one_thread_of_blas_and_gives_back_the_others(monkeypatch):
         before = blas_threads()
         s4a.match_pair(mesh, mesh, n_coarse=100, k=10, k_init=6)
         after = blas_threads()
-    assert set(seen) == {1}
+    assert set(calls) == {1}
     assert after == before
     assert max(before) == 2

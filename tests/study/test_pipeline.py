@@ -91,14 +91,14 @@ def test_both_resolutions_are_as_smooth_when_their_variance_is_compared(study):
     for name, fields in (("low", smooth), ("raw", raw)):
         rows = (fields - fields.mean(0)).reshape(len(fields), -1)
         variance = np.linalg.svd(rows, compute_uv=False)[:-1] ** 2
-        found = pca[f"explained_variance_ratio_{name}"].values
-        assert found == pytest.approx(variance / variance.sum(), abs=1e-6)
+        result = pca[f"explained_variance_ratio_{name}"].values
+        assert result == pytest.approx(variance / variance.sum(), abs=1e-6)
     full, low, noisy = (pca[f"explained_variance_ratio{n}"].values[0] for n in ("", "_low", "_raw"))
     assert noisy < low
     assert abs(low - full) < abs(noisy - full)
 
 
-def test_the_template_plus_displacement_is_the_shape_after_its_motion(study):
+def test_the_template_plus_displacement_is_the_aligned_shape(study):
     registration = study["registration"].to_dataset()
     for name in registration["shape"].values:
         one = registration.sel(shape=name)
@@ -207,7 +207,7 @@ analyse(sys.argv[2:], store=sys.argv[1], **{OPTIONS})
 """
 
 
-def test_a_killed_run_goes_on_where_it_was(brain_files, study_of_files, tmp_path):
+def test_a_killed_run_resumes(brain_files, study_of_files, tmp_path):
     work = tmp_path / "study"
     with subprocess.Popen(
         [sys.executable, "-c", KILLED, str(work), *map(str, brain_files)],
@@ -309,14 +309,14 @@ def test_shapes_that_differ_in_pose_alone_do_not_differ(arrays):
         ),
     ],
 )
-def test_identical_shapes_give_finite_results_and_modes_only_beside_a_shape_that_differs(
+def test_identical_shapes_give_finite_results_and_modes_only_with_a_shape_that_differs(
     arrays, given, no_modes
 ):
     mesh = {"a": arrays["brain_01"], "b": arrays["brain_02"]}
     tree = analyse({f"s{i}": mesh[one] for i, one in enumerate(given)}, **OPTIONS)
     for node in tree.subtree:
         for name, data in node.to_dataset(inherit=False).data_vars.items():
-            # two shapes make no 3-cycle; of three, the second of two equal ones stands apart
+            # two shapes make no 3-cycle; of three, the second of two equal ones is excluded
             if data.dtype.kind == "f" and (
                 tree["network"].sizes["pair"] > 2 or "cycle" not in name
             ):
@@ -406,12 +406,12 @@ def test_a_second_run_in_the_same_folder_is_refused(brains, study_folder):
         analyse(brains, store=study_folder, **OPTIONS)
 
 
-def test_the_registered_surface_is_four_times_nearer_to_the_truth_than_nearest_neighbours():
+def test_the_registered_surface_is_four_times_more_accurate_than_nearest_neighbours():
     tree = synthetic.brains(4, 8000)
     truth = tree["truth"]
-    found = analyse(tree, n_coarse=3000, n_jobs=1)
+    result = analyse(tree, n_coarse=3000, n_jobs=1)
     errors = accuracy.accuracy(
-        found,
+        result,
         lambda shape, template: synthetic.position(
             truth, shape, truth[template]["reference_point"].values
         ),

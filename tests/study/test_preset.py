@@ -93,13 +93,13 @@ def test_a_misspelt_option_is_refused_with_the_one_that_is_meant(three):
         s4a.analyse(three, n_corse=300)
 
 
-def test_keywords_stand_in_the_place_of_those_of_options(three):
+def test_keywords_override_options(three):
     given = Options(n_coarse=200, k=12, k_init=8, n_pairs=3, seed=5)
     study = s4a.analyse(three, options=given, k=16, weights="equal")
     assert Options.from_report(study) == given.changed({"k": 16, "weights": "equal"})
 
 
-def test_pairs_of_the_paper_are_matched_one_way_after_icp_alone(three):
+def test_pairs_of_the_paper_are_matched_in_one_direction_after_icp(three):
     (name, template), (other, shape), _ = three.items()
     study = s4a.register_pairs(template, {other: shape}, name=name, preset="paper", **PAIR)
     assert "reverse" not in study.children
@@ -147,7 +147,7 @@ def test_a_new_shape_is_cleaned_and_registered_by_the_options_of_the_study(paper
 
 
 @pytest.fixture
-def seen(monkeypatch):
+def calls(monkeypatch):
     """The options by which a transfer matches pairs, one after the other."""
     options = []
     match = transfer.match_shapes
@@ -160,16 +160,16 @@ def seen(monkeypatch):
     return options
 
 
-def test_an_external_mesh_is_matched_by_the_options_of_the_study(paper, meshes, seen):
+def test_an_external_mesh_is_matched_by_the_options_of_the_study(paper, meshes, calls):
     external = meshes["brain_04"]
     with s4a.open_study(paper) as study:
-        found = s4a.transfer_labels(
+        result = s4a.transfer_labels(
             study, external["label"].values, source=external, targets=["brain_01"]
         )
-        assert seen == [Options.from_report(study)]  # one way
-    assert seen[0].preset == "paper"
-    assert seen[0].n_coarse == OPTIONS["n_coarse"]
-    assert found["brain_01"].sizes["vertex"] == 1500
+        assert calls == [Options.from_report(study)]  # one direction
+    assert calls[0].preset == "paper"
+    assert calls[0].n_coarse == OPTIONS["n_coarse"]
+    assert result["brain_01"].sizes["vertex"] == 1500
 
 
 def transfers(external):
@@ -183,20 +183,20 @@ def transfers(external):
     }
 
 
-def test_through_the_median_a_template_is_matched_once_for_all_shapes(paper, meshes, seen):
+def test_through_the_median_a_template_is_matched_once_for_all_shapes(paper, meshes, calls):
     external = meshes["brain_04"]
     with s4a.open_study(paper) as study:
-        found = s4a.transfer_labels(study, external["label"].values, source=external)
-    assert len(found.children) == 3
-    assert len(seen) == 1
+        result = s4a.transfer_labels(study, external["label"].values, source=external)
+    assert len(result.children) == 3
+    assert len(calls) == 1
 
 
 def test_votes_for_labels_spread_unless_the_study_or_its_pairs_are_of_the_paper(
     study, paper, three, meshes
 ):
     def shares(tree, mesh, **options):
-        found = s4a.transfer_labels(tree, mesh["label"].values, targets=["brain_02"], **options)
-        return found["brain_02"]["label_share"].values
+        result = s4a.transfer_labels(tree, mesh["label"].values, targets=["brain_02"], **options)
+        return result["brain_02"]["label_share"].values
 
     def spreads(tree, mesh, **options):
         default, *sharp_and_spread = (
@@ -222,7 +222,7 @@ def test_votes_for_labels_spread_unless_the_study_or_its_pairs_are_of_the_paper(
 
 
 @pytest.mark.parametrize("what", ["labels", "scalars", "landmarks"])
-def test_a_transfer_refuses_by_name_what_its_preset_fixes(what, study, paper, meshes, seen):
+def test_a_transfer_refuses_by_name_what_its_preset_fixes(what, study, paper, meshes, calls):
     external = meshes["brain_04"]
     carry = transfers(external)[what]
     message = "preset 'paper' sets bidirectional=False; found bidirectional=True: leave out one"
@@ -231,7 +231,7 @@ def test_a_transfer_refuses_by_name_what_its_preset_fixes(what, study, paper, me
     with s4a.open_study(paper) as fixed:
         with pytest.raises(ValueError, match=message):
             carry(fixed, source=external, bidirectional=True)
-        assert seen == []
+        assert calls == []
         carry(
             fixed,
             source=external,
@@ -240,7 +240,7 @@ def test_a_transfer_refuses_by_name_what_its_preset_fixes(what, study, paper, me
             bidirectional=False,
             full_resolution_iterations=0,
         )
-    assert {name: getattr(seen[0], name) for name in DEFAULTS} == DEFAULTS | {
+    assert {name: getattr(calls[0], name) for name in DEFAULTS} == DEFAULTS | {
         "bidirectional": False,
         "full_resolution_iterations": 0,
     }
@@ -289,16 +289,16 @@ def test_an_external_mesh_needs_more_than_a_study_of_pairs(three):
 
 
 def test_the_commands_take_the_preset_between_files_and_to_a_study(
-    paper, brain_files, tmp_path, monkeypatch, seen, capsys
+    paper, brain_files, tmp_path, monkeypatch, calls, capsys
 ):
     source, target, *_ = map(str, brain_files)
     labels = tmp_path / "labels.npy"
     np.save(labels, np.zeros(1500, int))
     to = ["transfer", source, "--labels", str(labels), "--out", str(tmp_path)]
     assert main([*to[:2], target, *to[2:], "--preset", "paper", *FLAGS]) == 0
-    assert (seen[0].preset, seen[0].k) == ("paper", OPTIONS["k"])
+    assert (calls[0].preset, calls[0].k) == ("paper", OPTIONS["k"])
     assert main([*to[:2], str(paper), *to[2:], "--k", "20", "--preset", "paper"]) == 0
-    assert (seen[1].preset, seen[1].k) == ("paper", 20)
+    assert (calls[1].preset, calls[1].k) == ("paper", 20)
     assert main([*to[:2], str(paper), *to[2:], "--full-resolution-iterations", "1"]) == 2
     assert "preset 'paper' sets --full-resolution-iterations 0; found" in capsys.readouterr().err
     assert (

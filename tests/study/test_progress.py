@@ -1,4 +1,4 @@
-"""How far a run is, while it goes on, after it was stopped or killed, and at its end."""
+"""Progress of a run: running, stopped, killed and finished."""
 
 import json
 import subprocess
@@ -14,25 +14,25 @@ from s4a.study.progress import FILE, STAGES, status
 
 def test_a_finished_run_has_done_all_of_every_stage(brains, tmp_path, capsys):
     analyse(brains, store=tmp_path, **OPTIONS).close()  # one that no other test has run again
-    found = status(tmp_path)
-    assert found.state == "finished"
-    assert tuple(found.stages) == STAGES
-    assert all(stage.done == stage.all and stage.ended for stage in found.stages.values())
-    assert found.stages["registration"].all == 4
-    assert found.failures == {}
-    assert (found.memory, found.processes) == (0, 0)
+    result = status(tmp_path)
+    assert result.state == "finished"
+    assert tuple(result.stages) == STAGES
+    assert all(stage.done == stage.all and stage.ended for stage in result.stages.values())
+    assert result.stages["registration"].all == 4
+    assert result.failures == {}
+    assert (result.memory, result.processes) == (0, 0)
     assert cli.main(["status", str(tmp_path)]) == 0
     first, _, *lines = capsys.readouterr().out.splitlines()
     assert first.startswith("finished at 20")
     assert [line.split("  ")[0] for line in lines] == list(STAGES)
 
 
-def test_a_run_that_goes_on_or_is_stopped_says_how_far_it_is(brains, tmp_path, monkeypatch, capsys):
-    seen = []
+def test_a_running_or_stopped_run_has_a_progress(brains, tmp_path, monkeypatch, capsys):
+    calls = []
 
     def remesh(folder, name, options):
         if name == "brain_03":
-            seen.append(status(folder))
+            calls.append(status(folder))
             cli.main(["status", str(folder)])
             raise KeyboardInterrupt
         return tasks.remesh_shape(folder, name, options)
@@ -41,10 +41,10 @@ def test_a_run_that_goes_on_or_is_stopped_says_how_far_it_is(brains, tmp_path, m
     monkeypatch.setattr(pipeline, "remesh_shape", remesh)
     with pytest.raises(KeyboardInterrupt):
         analyse(brains, store=tmp_path, **OPTIONS)
-    (found,) = seen
-    assert (found.state, found.processes >= 1, found.memory > 10) == ("running", True, True)
-    now, before = found.stages["remesh and spectrum"], found.stages["compare"]
-    assert (now.done, now.all, now.had, now.ended) == (2, 4, 0, False)
+    (result,) = calls
+    assert (result.state, result.processes >= 1, result.memory > 10) == ("running", True, True)
+    now, before = result.stages["remesh and spectrum"], result.stages["compare"]
+    assert (now.done, now.all, now.done_before, now.ended) == (2, 4, 0, False)
     assert (before.done, before.all, before.ended) == (4, 4, True)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("running since 20")
@@ -68,17 +68,17 @@ def test_a_run_that_goes_on_or_is_stopped_says_how_far_it_is(brains, tmp_path, m
 
 @pytest.fixture
 def note(study_folder, tmp_path):
-    """Puts a changed note of a finished run into a folder."""
+    """Write a changed status file of a finished run into a folder."""
 
     def put(**changes):
-        said = json.loads((study_folder / FILE).read_text())
-        (tmp_path / FILE).write_text(json.dumps(said | changes))
+        message = json.loads((study_folder / FILE).read_text())
+        (tmp_path / FILE).write_text(json.dumps(message | changes))
         return tmp_path
 
     return put
 
 
-def test_a_run_whose_process_is_gone_is_stopped_and_one_of_another_machine_elsewhere(note, capsys):
+def test_a_run_without_process_is_stopped_and_one_of_another_machine_elsewhere(note, capsys):
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     assert status(note(over="", owner=gone.pid)).state == "stopped"
@@ -107,6 +107,6 @@ def test_a_note_of_another_form_is_refused(tmp_path, text):
         status(tmp_path)
 
 
-def test_a_folder_in_which_nothing_was_begun_is_told(tmp_path, capsys):
+def test_a_folder_without_a_run_is_an_error(tmp_path, capsys):
     assert cli.main(["status", str(tmp_path)]) == 2
     assert "no run of this version of s4a has begun there" in capsys.readouterr().err

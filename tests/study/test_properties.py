@@ -127,10 +127,10 @@ def test_the_displacement_of_a_pair(brains, pair, transforms, unit, seed):
     size = size_of(Y, S)
     X, T, _ = renumbered(moved(X, transforms[0], unit), T, seed)
     Y, S, order = renumbered(moved(Y, transforms[1], unit), S, seed + 1)
-    found = match_pair(as_dataset(X, T), as_dataset(Y, S), **OPTIONS)["displacement"].values / unit
+    result = match_pair(as_dataset(X, T), as_dataset(Y, S), **OPTIONS)["displacement"].values / unit
     wanted = Rotation.from_rotvec(transforms[1][0]).apply(pair[order])
     # the displacement is kept in single precision
-    assert np.linalg.norm(found - wanted, axis=1).max() < 1e-5 * size
+    assert np.linalg.norm(result - wanted, axis=1).max() < 1e-5 * size
 
 
 OF_STUDY = {"n_coarse": 300, "k_init": 12, "k": 20, "intersections": False}
@@ -160,18 +160,18 @@ def test_the_study_of_a_collection(collection, transforms, unit, seed, order):
     close = {"rtol": 1e-4, "atol": 1e-6}
     for variable in ("distance_to_limit", "latent_eigenvalue"):
         np.testing.assert_allclose(other["latent"][variable], one["latent"][variable], **close)
-    found, wanted = other["pca"].to_dataset(), one["pca"].to_dataset()
+    result, wanted = other["pca"].to_dataset(), one["pca"].to_dataset()
     np.testing.assert_allclose(
-        found["standard_deviation"] / unit, wanted["standard_deviation"], **close
+        result["standard_deviation"] / unit, wanted["standard_deviation"], **close
     )
     np.testing.assert_allclose(
-        found["explained_variance_ratio"], wanted["explained_variance_ratio"], **close
+        result["explained_variance_ratio"], wanted["explained_variance_ratio"], **close
     )
-    sign = np.sign((found["score"] * wanted["score"]).sum("shape"))
-    np.testing.assert_allclose(found["score"] * sign, wanted["score"], rtol=0, atol=1e-4)
+    sign = np.sign((result["score"] * wanted["score"]).sum("shape"))
+    np.testing.assert_allclose(result["score"] * sign, wanted["score"], rtol=0, atol=1e-4)
     d, e = (tree["registration"]["displacement"].values for tree in (one, other))
     d = Rotation.from_rotvec(transforms[names.index(template)][0]).apply(
         d[:, old_vertex[template]].reshape(-1, 3)
     )
-    gap = np.linalg.norm(e / unit - d.reshape(e.shape), axis=2)
-    assert gap.max() < 1e-4 * size_of(*shapes[template])
+    distance = np.linalg.norm(e / unit - d.reshape(e.shape), axis=2)
+    assert distance.max() < 1e-4 * size_of(*shapes[template])

@@ -1,4 +1,4 @@
-"""Flagged shapes stay apart (5.1): registered and told, and the others know nothing of them."""
+"""Flagged shapes (5.1) are registered and reported, without effect on the others."""
 
 import numpy as np
 import pytest
@@ -51,12 +51,12 @@ def study(folder):
 
 
 def results(study, stage):
-    """A stage without what is said of flagged shapes."""
+    """A stage without the results of flagged shapes."""
     data = study[stage].to_dataset().drop_attrs(deep=False)
     return data.drop_vars(["score_excluded", "shape_excluded"], errors="ignore")
 
 
-def test_the_results_of_the_others_are_the_same_to_the_bit_as_without(alone, study):
+def test_the_results_of_the_others_are_bit_identical_to_those_without(alone, study):
     for stage in ("network", "latent", "pca"):
         assert results(study, stage).identical(results(alone, stage)), stage
     names = alone["registration"]["shape"].values
@@ -68,11 +68,11 @@ def test_the_results_of_the_others_are_the_same_to_the_bit_as_without(alone, stu
 def test_a_shape_with_too_few_eigenfunctions_is_excluded_and_takes_no_k_from_the_others(study):
     report = study["report"].to_dataset().sel(shape="corner")
     assert report["status"].item() == "excluded"
-    assert "only 2 eigenfunctions, where 5 of 5 shapes have 20 or more" in report["reason"].item()
+    assert "only 2 eigenfunctions, but 5 of 5 shapes have 20 or more" in report["reason"].item()
     assert study["network"]["fmap"].shape[1:] == (20, 20)
 
 
-def test_doubtful_shapes_are_registered_and_named(study):
+def test_flagged_shapes_are_registered_and_named(study):
     report = study["report"].to_dataset().sel(shape=FLAGGED)
     assert report["status"].values.tolist() == ["flagged"] * 2
     assert report["flag_kinds"].values.tolist() == ["unit"] * 2
@@ -86,7 +86,7 @@ def test_doubtful_shapes_are_registered_and_named(study):
     assert (match.values == np.arange(match.size)).mean() > 0.9  # the same surface, smaller
 
 
-def test_a_finished_study_with_doubtful_shapes_is_not_computed_again(folder, mixed):
+def test_a_finished_study_with_flagged_shapes_is_not_computed_again(folder, mixed):
     kept = [path for stage in ("latent", "registration") for path in (folder / stage).glob("*.nc")]
     before = {path: path.stat().st_mtime_ns for path in kept}
     analyse(mixed, store=folder, **OPTIONS).close()
@@ -94,9 +94,9 @@ def test_a_finished_study_with_doubtful_shapes_is_not_computed_again(folder, mix
     assert len(before) == len(FLAGGED) + 7
 
 
-def test_statistics_leave_them_out_and_say_whom(alone, study, caplog):
-    found = statistics.outliers(study)
-    assert found.identical(statistics.outliers(alone))
+def test_statistics_exclude_flagged_shapes_and_name_them(alone, study, caplog):
+    result = statistics.outliers(study)
+    assert result.identical(statistics.outliers(alone))
     assert "flagged and excluded: a_metre, z_inch" in caplog.text
     values = dict(zip(study["registration"]["shape"].values.tolist(), range(7), strict=True))
     test = statistics.regression(study, values, n_permutations=9)
@@ -106,7 +106,7 @@ def test_statistics_leave_them_out_and_say_whom(alone, study, caplog):
     assert as_array["standard_score"].equals(test["standard_score"])
 
 
-def test_they_enter_modes_and_statistics_on_demand(folder, mixed, study):
+def test_flagged_shapes_are_included_on_request(folder, mixed, study):
     kept = statistics.with_flagged(study)
     assert kept["pca"].sizes["shape"] == statistics.outliers(kept).sizes["shape"] == 7
     assert left_out(kept) == []
@@ -116,7 +116,7 @@ def test_they_enter_modes_and_statistics_on_demand(folder, mixed, study):
     analyse(mixed, store=folder, **OPTIONS).close()
 
 
-def test_a_run_can_stop_at_them_before_its_long_stages(mixed, tmp_path):
+def test_a_run_can_stop_at_flagged_shapes_before_its_long_stages(mixed, tmp_path):
     with pytest.raises(
         ValueError, match=r"(?s)3 of 8 shapes are flagged.*3 unit: a_metre, corner, z_inch"
     ):
@@ -126,21 +126,21 @@ def test_a_run_can_stop_at_them_before_its_long_stages(mixed, tmp_path):
         analyse(mixed, quality_control="stop", include_flagged=True, **OPTIONS)
 
 
-def test_a_doubtful_shape_is_the_template_where_it_is_named(mixed):
+def test_a_flagged_shape_is_the_template_if_given_by_name(mixed):
     study = analyse(mixed, template="a_metre", **OPTIONS)
     assert study["registration"].attrs["template"] == "a_metre"
     assert left_out(study) == ["z_inch"]
-    assert "a_metre, which was named, is itself flagged" in study["report"].attrs["remarks"]
+    assert "a_metre, given by name, is flagged" in study["report"].attrs["remarks"]
 
 
-def test_where_fewer_than_two_are_beyond_doubt_all_are_treated_alike(good):
+def test_if_fewer_than_two_shapes_are_not_flagged_all_are_used(good):
     (X, T), (Y, S), (Z, U) = list(good.values())[:3]
     study = analyse({"mm": (X, T), "m": (Y / 1000, S), "km": (Z / 1e6, U)}, **OPTIONS)
     assert study["latent"].sizes["shape"] == 3
     assert "flagged" not in study["report"]["status"].values
 
 
-def test_a_new_shape_is_placed_as_in_the_study_of_the_others(alone, study, good):
+def test_a_new_shape_is_inserted_as_in_the_study_of_the_others(alone, study, good):
     new = {"new": good["brain_03"]}
     a, b = (insert(one, new) for one in (alone, study))
     assert a["pca"]["score"].equals(b["pca"]["score"])
@@ -148,7 +148,7 @@ def test_a_new_shape_is_placed_as_in_the_study_of_the_others(alone, study, good)
     assert insert(study, {"new": (X / 1000, T)})["report"]["status"].item() == "flagged"
 
 
-def test_panels_and_page_mark_them(study):
+def test_panels_and_page_mark_flagged_shapes(study):
     tabs = explore(study)
     for title in tabs.tabs.titles:
         tabs[title]
@@ -173,7 +173,7 @@ def test_the_summary_begins_with_what_to_decide_and_fits_on_a_screen(study):
     assert max(map(len, lines)) <= 100
 
 
-def test_a_summary_of_many_doubts_long_names_and_long_commands_fits_on_a_screen_too(study):
+def test_a_summary_of_many_flags_and_long_names_fits_on_a_screen(study):
     report = study["report"].to_dataset()
     n = 60
     names = [f"{i:03d}_{'of_a_very_long_name_' * 4}" for i in range(n)]

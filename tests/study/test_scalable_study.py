@@ -86,9 +86,9 @@ def test_the_low_resolution_is_the_reduced_basis_of_scalable(sampled):
 
 def test_the_paper_on_scalable_is_what_table_2_compares(brains, paper):
     names = {"n_coarse": 400, "k_init": 10, "k": 24, "methods": ["SCALABLE"]}
-    found = s4a.compare_collection(brains, preset="paper", **names).isel(algorithm=0)
-    assert paper["latent"].attrs["median"] == found["median_shape"].item()
-    assert found["distance_to_limit"].values == pytest.approx(
+    result = s4a.compare_collection(brains, preset="paper", **names).isel(algorithm=0)
+    assert paper["latent"].attrs["median"] == result["median_shape"].item()
+    assert result["distance_to_limit"].values == pytest.approx(
         paper["latent/distance_to_limit"].values, rel=1e-3
     )
     registration = paper["registration"].to_dataset()
@@ -96,7 +96,7 @@ def test_the_paper_on_scalable_is_what_table_2_compares(brains, paper):
         X = Shape(paper["original"][name].to_dataset())
         X = X.to_frame(X.original["position"].values)
         match = registration["registered_match"].sel(shape=name).values
-        theirs = found["collection_chamfer"].sel(dense_match="latent", shape=name).item()
+        theirs = result["collection_chamfer"].sel(dense_match="latent", shape=name).item()
         assert metrics.chamfer(X, X[match]) == pytest.approx(theirs, rel=0.01)
 
 
@@ -166,8 +166,8 @@ def test_a_new_shape_comes_in_by_local_functions_too(paper, meshes):
 def test_pairs_are_matched_by_it(meshes):
     source, target, *_ = meshes.values()
     small = {name: OPTIONS[name] for name in ("n_coarse", "k_init", "k")}
-    found = s4a.match_pair(source, source, method="scalable", **small)
-    assert (found["match"].values == np.arange(1500)).all()
+    result = s4a.match_pair(source, source, method="scalable", **small)
+    assert (result["match"].values == np.arange(1500)).all()
     study = s4a.register_pairs(
         source, {"other": target}, method="scalable", bidirectional=False, **small
     )
@@ -175,17 +175,17 @@ def test_pairs_are_matched_by_it(meshes):
 
 
 def test_an_external_mesh_is_matched_by_it(paper, meshes, monkeypatch):
-    seen = []
+    calls = []
     match = transfer.match_shapes
 
     def watched(source, target, options):
-        seen.append((source.is_sampled, target.is_sampled, options.method))
+        calls.append((source.is_sampled, target.is_sampled, options.method))
         return match(source, target, options)
 
     monkeypatch.setattr(transfer, "match_shapes", watched)
     external = meshes["brain_03"]
     s4a.transfer_labels(paper, external["label"].values, source=external, targets=["brain_01"])
-    assert seen == [(True, True, "scalable")]
+    assert calls == [(True, True, "scalable")]
 
 
 def test_what_it_cannot_have_is_refused_by_name(brain_files, tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""``rng=`` beside ``seed=`` (SPEC 7): in every public function that takes a seed, and the same."""
+"""``rng=`` (SPEC 7) in every public function that takes a seed gives the same as ``seed=``."""
 
 import numpy as np
 import pytest

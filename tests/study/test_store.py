@@ -1,4 +1,4 @@
-"""A study on disk: keys, whole files, one run at a time, and what is read is what was written."""
+"""A study on disk: keys, complete files, one run at a time, round trips."""
 
 import os
 import subprocess
@@ -268,12 +268,12 @@ def test_parts_of_a_registration_are_parts_of_the_whole(study_folder, study):
     assert open_study(study_folder)["registration"]["displacement"].identical(whole)
 
 
-def test_a_file_written_anew_after_it_was_opened_is_refused(tmp_path):
+def test_a_file_written_again_after_it_was_opened_is_an_error(tmp_path):
     store.write(dataset(position=np.zeros((700, 3))), tmp_path / "a.nc", "k")
-    found = netcdf.open_file(tmp_path / "a.nc")
+    result = netcdf.open_file(tmp_path / "a.nc")
     store.write(dataset(position=np.ones((700, 3))), tmp_path / "a.nc", "other")
     with pytest.raises(ValueError, match="written again since it was opened; open the study again"):
-        found.load()
+        result.load()
 
 
 def test_a_folder_with_files_of_somebody_else_is_refused_and_not_touched(tmp_path):
@@ -282,7 +282,7 @@ def test_a_folder_with_files_of_somebody_else_is_refused_and_not_touched(tmp_pat
     synthetic.sphere(50).to_netcdf(tmp_path / "original" / "mine.nc", engine="h5netcdf")
     (tmp_path / "original" / ".draft.tmp").write_bytes(b"mine")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    message = r"is no study and is not empty \(it has original, pca.nc\): give a new or an empty"
+    message = r"is not a study and not empty \(it has original, pca.nc\): give a new or an empty"
     with pytest.raises(ValueError, match=message), store.lock(tmp_path):
         pass
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
@@ -293,7 +293,7 @@ def test_a_study_that_was_copied_without_its_lock_is_still_a_study(tmp_path):
     store.write(synthetic.sphere(50), tmp_path / "original" / "a.nc", "key")
     mine.write_bytes(b"mine")
     with store.lock(tmp_path):
-        assert mine.exists()  # only temporary files of our own go
+        assert mine.exists()  # only temporary files of s4a are removed
 
 
 def test_a_lock_that_is_a_symbolic_link_is_not_followed(tmp_path):

@@ -1,4 +1,4 @@
-"""What the tests in a browser share: where to look in a page, and what is found there."""
+"""Selectors and checks of the tests in a browser."""
 
 import contextlib
 import json
@@ -75,7 +75,7 @@ CONTRAST = r"""(root, [fields, noTexts]) => {
 
 
 def watched(page, messages):
-    """A page whose errors are collected, those of its console as well."""
+    """Return a page that collects its errors, also those of the console."""
     page.on("console", lambda m: m.type == "error" and messages.append(m.text))
     page.on("pageerror", lambda error: messages.append(str(error)))
     return page
@@ -114,7 +114,7 @@ def lay_out(page):
 
 
 def settled(page, check, act=lambda: None, seconds=30):
-    """What a check gives once it holds; an action that a busy browser may lose is repeated.
+    """Return the result of a check once it holds; repeat an action that a busy browser may lose.
 
     A check that is False or raises an AssertionError is asked again.
     """
@@ -134,7 +134,7 @@ def settled(page, check, act=lambda: None, seconds=30):
 
 
 def redrawn(canvas, before):
-    """The pixels of a view that are no longer those of before, and stay as they are."""
+    """Return the pixels of a view once they have changed and are stable."""
     seen = [before]
 
     def rests():
@@ -156,7 +156,7 @@ def move(slider, value):
 
 
 def cursor(canvas, *keys):
-    """Start the cursor on a view and press keys; the vertex on which it then stands."""
+    """Start the cursor on a view and press keys; return its vertex."""
     canvas.focus()
     for key in ("c", *keys):
         canvas.press(key)
@@ -164,7 +164,7 @@ def cursor(canvas, *keys):
 
 
 def barriers(page, context=None):
-    """What axe finds serious or critical: rule, element, and why."""
+    """Return the serious and critical findings of axe: rule, element and reason."""
     found = axe.Axe().run(page, context).response["violations"]
     return [
         (rule["id"], node["html"], node["failureSummary"])
@@ -175,7 +175,7 @@ def barriers(page, context=None):
 
 
 def change_theme(page, theme):
-    """Choose a theme of JupyterLab, and wait until it is there and its picture in between gone."""
+    """Select a theme of JupyterLab, and wait until it is applied."""
     page.evaluate(
         "(theme) => jupyterapp.commands.execute('apputils:change-theme', { theme })", theme
     )
@@ -188,7 +188,7 @@ def change_theme(page, theme):
 
 @contextlib.contextmanager
 def themed(page, theme):
-    """The page in a theme of JupyterLab, and in the light one afterwards."""
+    """Show the page in a theme of JupyterLab, and restore the light theme afterwards."""
     try:
         change_theme(page, theme)
         yield
@@ -197,18 +197,18 @@ def themed(page, theme):
 
 
 def contrasts(part):
-    """Contrast and text of all that is read in a part of a page."""
+    """Return contrast and text of all texts in a part of a page."""
     return part.evaluate(CONTRAST, [FIELDS, NO_TEXTS])
 
 
 def faint(part):
-    """How many texts are in a part of a page, and those that cannot be read on their ground."""
+    """Return the number of texts in a part of a page, and the texts with too little contrast."""
     found = contrasts(part)
     return len(found), [(round(ratio, 1), text) for ratio, text in found if ratio < 4.5]
 
 
 def chosen(page, control, label):
-    """Choose a value of a page's control."""
+    """Select a value of a control of a page."""
     page.locator(f"#c-{control}").select_option(label)
 
 
@@ -228,7 +228,7 @@ def notebooks(folder, **cells):
 
 
 def check_read(panel, least, width=None):
-    """The smallest text of a panel has at least so many pixels, and nothing is cut off."""
+    """Check that the smallest text of a panel has enough pixels, and nothing is cut off."""
     lay_out(panel.page)
     settled(panel.page, lambda: assert_read(panel, least, width))
 
@@ -246,14 +246,14 @@ def assert_read(panel, least, width):
 
 
 def check_barriers(page, part):
-    """Axe finds nothing serious in a part of a page."""
+    """Check that axe finds nothing serious in a part of a page."""
     part.evaluate("(e) => (e.id = 'looked-at')")
     assert barriers(page, "#looked-at") == []
     part.evaluate("(e) => e.removeAttribute('id')")
 
 
 def check_themes(page, theme, parts, least):
-    """Every text of every part can be read in a theme; `parts` by name, made when looked at."""
+    """Check the contrast of every text of the `parts` (by name) in a theme."""
     with themed(page, theme):
         for name, make in parts.items():
             part = make()

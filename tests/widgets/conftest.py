@@ -1,4 +1,4 @@
-"""Browsers, a JupyterLab of a module's own, and pages without kernel and network."""
+"""Browsers, a JupyterLab for each module, and pages without kernel and network."""
 
 import contextlib
 import os
@@ -13,7 +13,7 @@ import pytest
 
 @pytest.fixture(scope="module")
 def lab(folder):
-    """The address of a JupyterLab of its own."""
+    """Start a JupyterLab and return its address."""
     with contextlib.closing(socket.socket()) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -63,7 +63,7 @@ def wait_for(address, log, seconds=60):
 
 
 def chromium():
-    """How Chromium is started; the test is skipped where it is not installed."""
+    """Start Chromium; skip the test if it is not installed."""
     from browsing import chromium
 
     if chromium.PATH is None:
@@ -107,7 +107,7 @@ def offline(browser):
 
 @pytest.fixture
 def show(offline, tmp_path):
-    """What opens a saved page, or that of a panel, which is closed; no page may say an error."""
+    """Open a saved page, or the page of a panel, which is closed; no page may have an error."""
     from browsing import DRAWN, watched
 
     pages, errors = [], []

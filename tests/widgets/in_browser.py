@@ -37,12 +37,12 @@ class Without:
 
 
 def refuse(thread):
-    """As Pyodide says it."""
+    """Raise the error of Pyodide."""
     raise RuntimeError("can't start new thread")
 
 
 def block():
-    """From now on no module that is lacking is found, and no thread starts.
+    """Hide the modules that Pyodide lacks, and forbid threads.
 
     scikit-learn is loaded before, as its newest version, unlike that of Pyodide, needs pipes; what
     it loaded of joblib and multiprocessing is loaded again without their compiled part.
@@ -92,7 +92,7 @@ def panels_of(study):
 
 
 def refusals(shapes):
-    """What cannot be done here, and the sentence that says so."""
+    """Return what cannot be done here, and its error message."""
     import numpy as np
 
     import s4a

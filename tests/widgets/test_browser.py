@@ -504,7 +504,7 @@ def test_every_control_has_a_tooltip(sizes, title):
 
 
 def test_sliders_keep_their_arrow_keys_in_notebook_7(sizes):
-    """Its shortcuts hear keys before the page, unless what has the focus says not to."""
+    """Notebook 7 handles keys before the page, unless the focused element prevents that."""
     sizes.evaluate("""() => document.addEventListener("keydown", (event) => {
       if (event.target.hasAttribute("data-lm-suppress-shortcuts")) return;
       event.preventDefault();
@@ -823,7 +823,7 @@ def test_full_resolution_is_drawn_once_after_a_drag(show, study):
 
 @pytest.fixture
 def few_values(monkeypatch):
-    """A page keeps three values of a slider instead of two dozen."""
+    """Record three values of a slider instead of 24."""
     monkeypatch.setattr(panel_page, "N_VALUES", 3)
 
 
@@ -1029,7 +1029,7 @@ def test_the_page_of_correspondences_follows_the_pointer_and_the_keyboard(show, 
 
 @pytest.fixture(scope="module")
 def compared():
-    """What two methods find on a pair of brains, with the truth."""
+    """Matches of two methods between two brains, with the ground truth."""
     brains = s4a.synthetic.brains(2, 900)
     one, two = (node.to_dataset() for node in brains["original"].children.values())
     reference = brains["truth/brain_02/reference_point"].values

@@ -1,4 +1,4 @@
-"""What a kernel in the browser can do: all that needs no compiled package but those of Pyodide."""
+"""A kernel in the browser: everything works with the compiled packages of Pyodide."""
 
 import json
 import os
@@ -17,7 +17,7 @@ pytest.importorskip("anywidget")
 
 @pytest.fixture(scope="module")
 def done(study_folder, tmp_path_factory):
-    """What the script did, in a process of its own and with its own temporary folder."""
+    """Return the results of the script, run in its own process and temporary folder."""
     place = str(tmp_path_factory.mktemp("browser"))
     environment = os.environ | {"TMPDIR": place, "TEMP": place, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(TESTS / "widgets" / "in_browser.py"), str(study_folder)]

@@ -75,14 +75,16 @@ def test_the_tiles_of_a_large_picture_are_those_of_a_small_one(page):
         for width in ("2560", "800")
     )
     large = large.convert("RGB").resize((800, small.height))
-    far = np.abs(np.asarray(large).astype(int) - np.asarray(small.convert("RGB")).astype(int))
-    assert far[40:-60].mean() < 3
+    difference = np.abs(
+        np.asarray(large).astype(int) - np.asarray(small.convert("RGB")).astype(int)
+    )
+    assert difference[40:-60].mean() < 3
 
 
 @modes
 def test_a_film_of_a_slider_goes_from_one_end_to_the_other_and_back(page):
     before = page.locator(".s4a-slider input").first.input_value()
-    with Image.open(io.BytesIO(downloaded(page, "Save film", transform="slider"))) as film:
+    with Image.open(io.BytesIO(downloaded(page, "Save film", motion="slider"))) as film:
         assert (film.n_frames, film.width, film.info["duration"]) == (50, 600, 80)
         frames = []
         for i in (0, 25, 49):

@@ -84,7 +84,7 @@ def folder(study_folder, tmp_path_factory):
 
 
 def opened(browser, lab, name):
-    """A page with a notebook whose cells ran; it keeps its errors and what it sends the kernel."""
+    """A page with an executed notebook; it records errors and messages to the kernel."""
     messages = []
     page = watched(browser.new_page(viewport={"width": 1280, "height": 3600}), messages)
     page.set_default_timeout(180_000)  # a machine may be busy
@@ -166,7 +166,7 @@ def test_the_mean_is_drawn_again_by_a_double_click(page):
 
 
 def test_the_deformed_surface_is_where_the_sum_of_modes_puts_it(page, study):
-    """Its outline beside that of a surface of the same vertices, drawn by the CPU's numbers."""
+    """Compare its outline with that of a surface with vertices deformed by NumPy."""
     scores = [2.0, -1.5, 1.0]
     shape = s4a.synthesize(study, scores)["position"].values
     mean = s4a.synthesize(study, [0.0] * 3)["position"].values

@@ -1,6 +1,6 @@
 """Panels without a browser.
 
-What they show equals the arrays, clicks do what they say, closing leaves nothing.
+What they show equals the arrays, clicks have their effect, closing removes all widgets.
 """
 
 import base64
@@ -721,7 +721,7 @@ def test_a_cell_that_runs_again_closes_its_previous_tabs(study, monkeypatch):
     monkeypatch.setattr(explore_module, "get_ipython", lambda: shell)
 
     def run(cell):
-        """What IPython does when a cell is run, and the tabs that it makes."""
+        """Run a cell as IPython does, and return its tabs."""
         shell.events.trigger("pre_run_cell", ExecutionInfo("", True, False, True, cell))
         monkeypatch.setattr(explore_module, "running_cell", lambda: cell)
         return s4a.explore(study)
@@ -971,7 +971,7 @@ def test_a_full_page_lists_what_is_not_recorded(panel, tmp_path):
     text = path.read_text(encoding="utf-8")
     data = recording(text)
     shapes = next(control for control in data["controls"] if control["id"] == "c-choice")
-    assert shapes["open"] == [0]
+    assert shapes["recorded"] == [0]
     assert "Only in a notebook" in text
     assert "changing shape" in text
 

@@ -1,4 +1,4 @@
-"""A notebook that is shown without its kernel says so in the place of a panel."""
+"""Without a kernel a notebook shows a note in place of a panel."""
 
 import json
 
@@ -71,7 +71,7 @@ window.ready = true;
 
 @pytest.fixture
 def framed(browser):
-    """Opens a frame in a page whose time is ours."""
+    """Open a frame in a page with a simulated clock."""
     page = browser.new_page()
     page.clock.install()
 
