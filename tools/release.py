@@ -23,7 +23,7 @@ PLACES = {
     "README.md": r"(https://mybinder\.org/v2/gh/)[\w.-]+/[\w.-]+(?=/HEAD)",
     "CITATION.cff": r'(repository-code: "https://github\.com/)[\w.-]+/[\w.-]+(?=")',
     "SECURITY.md": r"(https://github\.com/)[\w.-]+/[\w.-]+(?=/security)",
-    "s4a/cli/__init__.py": r"(https://github\.com/)[\w.-]+/[\w.-]+(?=/blob)",
+    "s4a/cli/__init__.py": r'(PAGE = "https://github\.com/)[\w.-]+/[\w.-]+(?=/blob)',
     "paper/paper.md": r"(https://github\.com/)[\w.-]+/s4a(?=\))",
     "paper/jose.md": r"(https://github\.com/)[\w.-]+/s4a(?=\))",
 }
