@@ -263,7 +263,7 @@ def test_invalid_parts_are_refused_with_the_reason(study, brain, tmp_path):
     nodes = {name: study[name] for name in ("original", "coarse", "latent", "registration")}
     with pytest.raises(ValueError, match="a finished study is needed; this one lacks pca"):
         complete(xr.DataTree.from_dict(nodes), brain)
-    with pytest.raises(ValueError, match="the part does not fit the shapes of the study"):
+    with pytest.raises(ValueError, match="the partial shape does not fit the study"):
         complete(study, (0.1 * X, T))
 
 
