@@ -439,7 +439,7 @@ def test_a_mesh_in_lps_and_one_that_was_mirrored_fill_the_same_voxels(scans, tmp
         ("paraview", {"extent": -1.0}, "extent needs a positive number .* found -1.0"),
         ("paraview", {"n_steps": 1}, "n_steps"),
         ("scalismo", {"n_modes": 0}, "n_modes"),
-        ("nifti", {"label": np.array(["a"] * 1500)}, "whole numbers .* found <U1"),
+        ("nifti", {"label": np.array(["a"] * 1500)}, "needs integers .* found <U1"),
         ("nifti", {}, "brain_01 was read from arrays, not from a volume: give a scan"),
         ("nifti", {"grid": "none.nii"}, "no file .*none.nii"),
     ],

@@ -178,13 +178,13 @@ THREE = {f"subject_{i}": TWO for i in (1, 2, 3)}
         (THREE, {"label": 1}, "gives the labels of each structure: leave out label="),
         ({"a": {"left": MESH}, "b": {"left": MESH}}, {}, "several structures needed; found left"),
         ({"a": MESH}, {}, "several structures of each subject: {subject: {structure: mesh}}"),
-        (THREE, {"reflect": "left"}, "reflect names 'left', none of the shapes .subject_1, subj"),
+        (THREE, {"reflect": "left"}, "'left' is not a shape .subject_1, subj"),
         (THREE, {"landmarks": "none"}, "landmarks: a folder needed, with one for each structure"),
         (THREE, {"features": "sulc"}, "structure left: features: no shape has a field 'sulc'"),
         ({"a b": TWO, "c": TWO}, {}, "names of shapes need"),
         ({"a": {"le/ft": MESH, "right": MESH}}, {}, "names of shapes need"),
         ({"a": {"left": "no.ply", "right": MESH}, "b": TWO}, {}, "left: shape a: no.ply is no fil"),
-        (THREE, {"template": "d"}, "template 'd' is none of the shapes"),
+        (THREE, {"template": "d"}, "template 'd' is not one of the shapes"),
         ({"a": TWO, "b": {"left": MESH}}, {}, "least 2 subjects that have it; right has only a"),
         ({"a": TWO, "b": {}}, {}, "a mesh of a structure needed; b has none"),
     ],
@@ -243,7 +243,7 @@ def test_invalid_new_subjects_are_refused(study, tmp_path):
     for given, options, words in [
         ({"new": MESH}, {}, r"several structures \(left, right\): {subject: {structure"),
         ({"new": {"middle": MESH}}, {}, "has no structure 'middle'; it has left, right"),
-        ({"new": TWO}, {"reflect": "left"}, r"reflect names 'left', none of the shapes \(new\)"),
+        ({"new": TWO}, {"reflect": "left"}, r"'left' is not a shape \(new\)"),
         ({"new": TWO}, {"landmarks": "none"}, "landmarks: a folder needed, with one for each"),
         ({"new": {"left": s4a.synthetic.sphere(9)}}, {}, "structure left: no shape can be insert"),
         ({template: {"left": MESH}}, {}, "structure left: new shapes need other names than the te"),
@@ -308,7 +308,7 @@ def test_landmarks_of_folders_and_tables_have_the_effect_of_those_in_memory(tmp_
     new_marks = marked({"new": new}, tmp_path / "new")
     (new_marks / "right/new.csv").unlink()
     inserted = insert_structures(study, {"new": new}, landmarks=new_marks, n_jobs=1)
-    assert "no file of landmarks for any right" in inserted["report"].attrs["remarks"]
+    assert "no landmark file for any right" in inserted["report"].attrs["remarks"]
     assert "guide_position" in inserted["structures/left/original/new"]
     assert "guide_position" not in inserted["structures/right/original/new"]
     for name in SIDES:
