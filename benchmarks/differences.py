@@ -260,8 +260,8 @@ Each other reading on top of the paper:
 **The norm of eq. 5.** The paper writes the norm of the Sobolev space $H_0^2$, in which $\\lVert f
 \\rVert = \\lVert \\Lambda^0 f \\rVert$ with the eigenvalues $\\Lambda^0$ of the limit shape. It
 does not say between which spaces $D_i - I$ is an operator. `norm` offers five interpretations.
-The choice decides which shape is the median, and therefore the template, and nothing else. Errors are those
-of the registration to that median.
+The choice decides which shape is the median, and therefore the template, and nothing else.
+Errors are those of the registration to that median.
 
 {norms}
 

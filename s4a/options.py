@@ -381,8 +381,8 @@ class Options:
         "vertices, near coarse ones, used for that projection; 0 means all", paper=0,
         section="after eq. 8", instead="on all vertices", see="method/shape", of="projection",
         pair=True)
-    remove_size: bool = registration(False, "align with scaling, so that displacements do not contain "
-        "size", of="registration")
+    remove_size: bool = registration(False, "align with scaling, so that "
+        "displacements do not contain size", of="registration")
     intersections: bool = quality(True, "count triangles that intersect others")
     quality_control: str = quality("exclude",
         "flagged shapes are excluded from the network, or the run stops",

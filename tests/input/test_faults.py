@@ -291,7 +291,7 @@ def test_a_wrong_registration_is_flagged():
     wrong, remarks = flagged({"a": 0.0, "b": 0.02, "c": 0.1})
     assert list(wrong) == ["c"]
     assert [(one.kind, one.flagged) for one in wrong["c"]] == [("registration", True)]
-    assert "registered wrongly (0.100)" in wrong["c"][0].words
+    assert "wrong (score 0.100" in wrong["c"][0].words
     assert remarks == []
     assert flagged({"a": 0.0, "b": 0.12, "c": 0.1})[0] == {}
 
