@@ -468,11 +468,11 @@ def transfer_labels(
     votes : bool
         Whether to return the share of every label.
     blur : float, optional
-        Radius over which votes are diffused, in multiples of the uncertainty of the match
-        (:func:`s4a.method.register.uncertainty`), so that label borders are smooth where the match
-        is uncertain.  A label that diffusion would remove keeps its vertices.  0, as in the paper,
-        disables diffusion.  The default is 1, or 0 with ``preset="paper"`` of the study or of an
-        external source.
+        Radius over which votes are diffused, as a multiple of the estimated match error at each
+        vertex (:func:`s4a.method.register.uncertainty`), so that label borders are smooth where the
+        match is uncertain.  A label that diffusion would remove keeps its vertices.  0, as in the
+        paper, disables diffusion.  The default is 1, or 0 with ``preset="paper"`` of the study or
+        of an external source.
     **options
         For an external source: options of :func:`register_pairs`, including ``preset``, which
         replace those of the study.
@@ -488,9 +488,9 @@ def transfer_labels(
     Raises
     ------
     ValueError
-        If the labels do not fit the source, a shape is not in the study, `blur` is not within 0 and
-        10, or an option is out of range, contradicts the preset, or is given without an external
-        source.
+        If the labels do not fit the source, a shape is not in the study, `blur` is not between 0
+        and 10, or an option is out of range, contradicts the preset, or is given without an
+        external source.
 
     See Also
     --------
@@ -645,15 +645,15 @@ def transfer_landmarks(
     landmarks : path or Dataset
         A landmark file, or a result of :func:`s4a.input.annotations.read_landmarks`.
     farthest : float
-        See :func:`s4a.input.landmarks.locate`.
+        Largest distance of a landmark from its surface, see :func:`s4a.input.landmarks.locate`.
 
     Returns
     -------
     DataTree
         For every target ``landmark_name``, ``landmark_position(landmark, xyz)`` on its surface, in
         its coordinates, ``landmark_triangle``, ``landmark_barycentric(landmark, corner)``,
-        ``landmark_confidence`` and, with several routes, ``landmark_disagreement``, the largest
-        distance of a route from their mean; with curves ``landmark_curve`` and
+        ``landmark_confidence`` and, if several matches are averaged, ``landmark_disagreement``, the
+        largest distance of one result from the mean; with curves ``landmark_curve`` and
         ``landmark_closed``, and empty names of added points.
 
     Raises

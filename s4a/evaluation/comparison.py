@@ -171,19 +171,19 @@ def compare(
     Parameters
     ----------
     source : path or Dataset
-        The reference; every match holds its vertices.
+        The reference; matches are indices of its vertices.
     target : path, Dataset, or dict of str to path or Dataset
         One mesh, or several with a name for each pair.
     methods : sequence of str, optional
         Some of :data:`METHODS`; by default all, or the five of the paper with its preset.
     truth : array, or dict of str to array, optional
         Ground truth: vertices or positions of the source, as in
-        :func:`s4a.evaluation.metrics.evaluate`; a dict if `target` is one.  If shapes are given as
-        paths, all vertices, here and in `landmarks`, are those of the files.
+        :func:`s4a.evaluation.metrics.evaluate`; a dict if `target` is a dict.  If shapes are given
+        as paths, all vertices, here and in `landmarks`, are those of the files.
     landmarks : tuple, or dict of str to tuple, optional
         Corresponding vertices or positions ``(p, 3)`` (of the source, of the target); a dict if
-        `target` is one.  By default 10 farthest-point samples of the source and the vertices of the
-        target that are nearest after alignment (4.1, step 3).
+        `target` is a dict.  By default 10 farthest-point samples of the source and the vertices of
+        the target that are nearest after alignment (4.1, step 3).
     n_coarse : int
         Number of vertices of the low-resolution mesh, and of samples of SCALABLE.
     k_init, k : int
@@ -192,7 +192,7 @@ def compare(
         Growth of the map in each iteration of ZoomOut, as in :func:`s4a.analyse`.
     preset : {None, "paper"}
         ``"paper"`` leaves out the methods of S4A and sets full_resolution_iterations=0 and
-        init="landmarks"; another value of these is refused.
+        init="landmarks"; other values raise ValueError.
     full_resolution_iterations : int, optional
         ZoomOut iterations of RE-MATCH refined that search all vertices of the source, by default 2.
     init : {"landmarks", "descriptors"}, optional

@@ -69,9 +69,9 @@ def clean(
 ) -> xr.Dataset:
     """Make a mesh an oriented edge- and vertex-manifold surface.
 
-    Vertices within 1e-7 of the bounding-box diagonal are welded.  Degenerate and duplicate
-    triangles are dropped, and zero-area triangles are removed by flipping their long edge.
-    Non-manifold edges and vertices are split, triangles are oriented consistently and
+    Vertices closer to each other than 1e-7 of the bounding-box diagonal are welded.  Degenerate and
+    duplicate triangles are dropped, and zero-area triangles are removed by flipping their long
+    edge. Non-manifold edges and vertices are split, triangles are oriented consistently and
     outwards, and small components are dropped.  Holes are kept unless `close_holes` is set.
 
     Parameters
@@ -88,7 +88,7 @@ def clean(
     Returns
     -------
     Dataset
-        With ``position``, ``corner_vertex``, ``file_vertex`` (copies of a split vertex share one)
+        With ``position``, ``corner_vertex``, ``file_vertex`` (equal for copies of a split vertex)
         and ``vertex_of_file``.  Repairs are counted in the attributes, see :func:`clean_arrays`,
         and summarized as ``status`` (ok or repaired) and ``reason``.
 

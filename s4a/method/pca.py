@@ -248,7 +248,7 @@ def pca(
 
 
 def synthesize(study: xr.DataTree, scores: Array) -> xr.Dataset:
-    """Reconstruct the shape of given scores: mean shape plus the sum of scores times deformations.
+    """Synthesise a shape from scores: the mean plus each score times the deformation of its mode.
 
     Parameters
     ----------

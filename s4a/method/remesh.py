@@ -278,14 +278,14 @@ def coarsen(
         A clean mesh: ``position`` and ``corner_vertex``, manifold, oriented; boundary and several
         components allowed.
     n_coarse : int
-        Target number of vertices.  The result has 5 % less to 10 % more, or as many as its topology
-        needs (hundreds of handles, n_coarse in the hundreds).  A mesh without more vertices is
-        returned unchanged.
+        Target number of vertices.  The result has between 95 % and 110 % of it, or as many as its
+        topology needs (hundreds of handles, n_coarse in the hundreds).  A mesh without more
+        vertices is returned unchanged.
     wrap : bool
         Remesh an alpha wrap of the mesh, for scans with irrelevant interior (needs the extra
         ``s4a[wrap]``).
     seed, rng : see :mod:`s4a.seeds`
-        Seeds select the first sample; seed 0 is an outermost vertex.
+        The seed selects the first sample; with seed 0 it is an outermost vertex.
 
     Returns
     -------
@@ -295,9 +295,9 @@ def coarsen(
         ``vertex_area``: A, the original vertex areas distributed by U, whose sum is the original
         area (after wrapping the areas of the coarse mesh); ``coarse_vertex``,
         ``coarse_weight (original_vertex, corner)``: U, with non-negative rows of sum 1.  Attributes
-        are the numbers of samples, iterations, and vertices lost with cut handles (U has rows for
-        them), Euler characteristic, boundary loops, and the kind of Laplacian ("robust" for
-        degenerate triangles).
+        are the numbers of samples, iterations, and vertices removed when handles were cut (U
+        keeps their rows), Euler characteristic, boundary loops, and the kind of Laplacian ("robust"
+        for degenerate triangles).
 
     Raises
     ------

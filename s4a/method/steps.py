@@ -649,10 +649,11 @@ def register_shape(
     template : str, optional
         By default the template of the study, or the median shape if nothing is registered yet.
     initial_transform : tuple (R, t), optional
-        Approximate rigid transform of the shape onto the template, between their frames.  By
+        Approximate rigid transform of the shape onto the template, between their frames (centred,
+        of unit area).  By
         default the alignment of the network; if there is none, ICP from the principal axes.
     dense_match : {"latent", "fmap"}, optional
-        Eq. 7, or eq. 3 and 4.
+        Match by the latent bases (eq. 7), or by functional maps (eq. 3 and 4).
     **options
         ``refine``, ``remove_size``, ``articulated`` and ``alignment`` of
         :func:`s4a.method.register.register`; ``n_projected`` and ``area_weighted`` of

@@ -79,8 +79,8 @@ def insert(
     landmarks : path, optional
         Folder with landmark files, see :func:`s4a.analyse`.
     reflect : str or list of str, optional
-        Names of new shapes to mirror, separated by commas, or ``"auto"`` for those of the other
-        side than the study.  By default none is mirrored.
+        Names of new shapes to mirror, separated by commas, or ``"auto"`` for those with the
+        opposite chirality of the study.  By default none is mirrored.
     compare : bool
         Compare each new shape with the study in unit, chirality, form and genus, and warn about
         suspect ones in ``/report``.
@@ -219,7 +219,7 @@ def reflected_of_new(
     if unknown:
         raise ValueError(
             f"reflect={reflect!r}: {listed(unknown)} is not a new shape ({listed(given)}); "
-            "'auto' mirrors new shapes of the other side than the study"
+            "'auto' mirrors new shapes with the opposite chirality"
         )
     return [name for name in names if name in meshes], []
 
