@@ -439,8 +439,8 @@ class Options:
         least = min(PER_FUNCTION * self.k, self.n_coarse)
         if 0 < self.n_samples < least:
             raise ValueError(
-                f"n_samples must be 0, for all vertices, or at least {least}, for k = {self.k}; "
-                f"found {self.n_samples}"
+                f"k = {self.k} needs n_samples = {least} or more, or n_samples = 0 for all "
+                f"vertices; found {self.n_samples}"
             )
 
     def check_against(self, names: list[str]) -> None:

@@ -147,7 +147,8 @@ def group_map(
         ``explained_share(vertex)``, ``p_vertex``, ``p_family_wise`` (max-T), ``p_false_discovery``
         (Benjamini and Hochberg), ``effect(vertex, xyz)`` = mean of the second group minus mean of
         the first, in sorted order, and ``effect_size``: Mahalanobis distance between the means of
-        two groups, Cohen's f of several.
+        two groups, Cohen's f of several.  For two groups the attribute ``difference`` names the
+        direction, such as "patient minus control".
 
     Raises
     ------
@@ -197,7 +198,11 @@ def map_groups(sample: Sample, options: dict[str, Any], of: str = "vector") -> x
         dof = len(x) - sum(basis.shape[1] for basis in model.bases)
         squared = squared * dof * (1 / np.unique(sample.values, return_counts=True)[1]).sum()
     return effect_map.merge(dataset(effect_size=np.sqrt(squared))).assign_attrs(
-        groups=sizes, of=of, **sample.attributes, **model.attributes()
+        groups=sizes,
+        difference=f"{names[1]} minus {names[0]}" if len(names) == 2 else "",
+        of=of,
+        **sample.attributes,
+        **model.attributes(),
     )
 
 

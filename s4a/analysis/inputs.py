@@ -185,7 +185,7 @@ def displacements_of(study: xr.DataTree) -> tuple[xr.Dataset, np.ndarray, np.nda
     require(registration, "displacement", "position", "corner_vertex", what="registration")
     flagged = left_out(study)
     if flagged:
-        log.warning("flagged and excluded: %s; see with_flagged", ", ".join(flagged))
+        log.warning("flagged shapes are excluded: %s", ", ".join(flagged))
     if registration.sizes["shape"] < 4:
         more = f", and {len(flagged)} flagged: {', '.join(flagged)}" if flagged else ""
         raise ValueError(

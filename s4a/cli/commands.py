@@ -246,7 +246,7 @@ def statistics(
     regress_on : COLUMN
         regression of shape on a number, such as age; its animation
     covariates : COLUMN
-        covariates of both
+        covariates of both, separated by spaces or commas
     table : PATH
         CSV with a column 'shape', in place of the table of the study
     variances
@@ -261,7 +261,8 @@ def statistics(
     if covariates and not (group or regress_on):
         raise ValueError("--covariates needs a test: give --group or --regress-on")
     tree, out = study_to_test(study, out, table, include_flagged)
-    options = {"covariates": covariates, "seed": seed, "variances": variances}
+    names = [name for word in covariates or () for name in word.split(",") if name] or None
+    options = {"covariates": names, "seed": seed, "variances": variances}
     write_statistics(tree, out, group, regress_on, permutations, options)
     return 0
 

@@ -427,13 +427,14 @@ def evaluation_table(evaluation: "xr.Dataset") -> str:
     evaluation : Dataset
         See :func:`s4a.analysis.statistics.evaluate`.
     """
-    columns = ["compactness", "generalization, kept: optimistic", "specificity"]
+    columns = ["compactness", "generalization (optimistic)", "specificity"]
     rows = []
     for c in range(min(10, evaluation.sizes["component"])):
-        cells = [measure_cell(evaluation, head.partition(",")[0], c) for head in columns]
+        cells = [measure_cell(evaluation, head.split()[0], c) for head in columns]
         rows.append([c + 1, *cells])
     unit = evaluation["generalization"].attrs["units"]
-    return f"lengths in {unit}, ± standard error\n{table(rows, ['components', *columns])}"
+    head = f"compactness: cumulative variance, in {unit} squared; others: lengths in {unit}"
+    return f"{head}; ± standard error\n{table(rows, ['components', *columns])}"
 
 
 def measure_cell(data: "xr.Dataset", name: str, c: int) -> str:
@@ -454,14 +455,16 @@ def significance(whole: "xr.Dataset", where: "xr.Dataset", name: str, study: "xr
         f"{name}{groups}: p = {whole['p_value'].item():.3g} over the whole shape, "
         f"the smallest possible is {attrs['smallest_p']:.2g}"
     ]
-    said = {"covariates": "covariates", "left_out": "left out, flagged or without a value"}
-    lines += [f"  {words}: {attrs[key]}" for key, words in said.items() if attrs[key]]
+    texts = {"covariates": "adjusted for", "left_out": "left out, flagged or without a value:"}
+    lines += [f"  {words} {attrs[key]}" for key, words in texts.items() if attrs[key]]
+    if where.attrs.get("difference"):
+        lines.append(f"  effect: {where.attrs['difference']}")
     corrections = {"p_family_wise": "family-wise", "p_false_discovery": "false discovery rate"}
     for variable, words in corrections.items():
         p_vertex = where[variable].values  # (n,)
         share = 100 * (area @ (p_vertex < 0.05)) / area.sum()
         lines.append(
-            f"  {share:.1f} % of the area under 0.05 ({words}), smallest {np.nanmin(p_vertex):.3g}"
+            f"  {words}: p < 0.05 on {share:.1f} % of the area, least p {np.nanmin(p_vertex):.3g}"
         )
     return "\n".join(lines)
 

@@ -247,7 +247,7 @@ def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch)
         "groups of sex (f: 3, m: 3)",
         "family-wise",
         "outliers:",
-        "lengths in mm",
+        "others: lengths in mm",
     ):
         assert words in message, words
     assert (out / "regression.html").read_text() == "1"
@@ -274,7 +274,7 @@ def test_the_command_refuses_what_makes_no_test_and_says_a_warning_once(folder, 
     flags = ["--group", "sex", "--covariates", "score", "--permutations", "9"]
     assert cli.main([*command, *flags, "--variances", "unequal"]) == 0
     assert caplog.text.count("groups under 10 shapes (f: 3, m: 3)") == 1
-    assert "covariates: covariate 'score'" in capsys.readouterr().out
+    assert "adjusted for covariate 'score'" in capsys.readouterr().out
 
 
 def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):

@@ -97,7 +97,7 @@ def test_a_finished_study_with_flagged_shapes_is_not_computed_again(folder, mixe
 def test_statistics_exclude_flagged_shapes_and_name_them(alone, study, caplog):
     result = statistics.outliers(study)
     assert result.identical(statistics.outliers(alone))
-    assert "flagged and excluded: a_metre, z_inch" in caplog.text
+    assert "flagged shapes are excluded: a_metre, z_inch" in caplog.text
     values = dict(zip(study["registration"]["shape"].values.tolist(), range(7), strict=True))
     test = statistics.regression(study, values, n_permutations=9)
     assert test.sizes["shape"] == 5
