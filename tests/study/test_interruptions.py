@@ -271,7 +271,7 @@ def test_a_disk_that_is_full_in_every_stage_keeps_what_is_finished(
 
     monkeypatch.setattr(os, "replace", renamed)
     while full:
-        with pytest.raises(OSError, match=f"{full[0]} cannot be written .*No space left.*goes on"):
+        with pytest.raises(OSError, match=f"{full[0]} cannot be written .*No space left.*resumes"):
             analyse(files, store=folder, intersections=False, **OPTIONS)
         full.pop(0)
     analyse(files, store=folder, intersections=False, **OPTIONS).close()
@@ -343,7 +343,7 @@ def test_a_folder_that_vanishes_ends_a_run_until_it_is_read_and_is_not_missed_in
     monkeypatch.setattr(os, "replace", renamed)
     for position in ("brain_02.ply", "original/brain_02.nc"):
         vanish_at.append(position)
-        with pytest.raises(OSError, match=r"brain_0.\.ply has .*gone since the run began"):
+        with pytest.raises(OSError, match=r"brain_0.\.ply disappeared since the run began"):
             analyse(meshes, **options)
         away.rename(meshes)
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("[!.]*.nc")}
@@ -571,7 +571,7 @@ def test_a_folder_that_cannot_be_written_is_one_error(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "replace", refused)
     with pytest.raises(
-        OSError, match=r"a.nc cannot be written .*Permission denied.*Finished files are whole"
+        OSError, match=r"a.nc cannot be written .*Permission denied.*Finished files are kept"
     ):
         store.write(synthetic.sphere(60), tmp_path / "a.nc", "key")
     assert netcdf.read(tmp_path / "a.nc").sizes["vertex"] == 50
