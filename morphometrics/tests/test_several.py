@@ -183,7 +183,7 @@ THREE = {f"subject_{i}": TWO for i in (1, 2, 3)}
         (THREE, {"features": "sulc"}, "structure left: features: no shape has a field 'sulc'"),
         ({"a b": TWO, "c": TWO}, {}, "names of shapes need"),
         ({"a": {"le/ft": MESH, "right": MESH}}, {}, "names of shapes need"),
-        ({"a": {"left": "no.ply", "right": MESH}, "b": TWO}, {}, "left: shape a: no.ply is not a file"),
+        ({"a": {"left": "no.ply", "right": MESH}, "b": TWO}, {}, "shape a: no.ply is not a file"),
         (THREE, {"template": "d"}, "template 'd' is not one of the shapes"),
         ({"a": TWO, "b": {"left": MESH}}, {}, "least 2 subjects that have it; right has only a"),
         ({"a": TWO, "b": {}}, {}, "a mesh of a structure needed; b has none"),
