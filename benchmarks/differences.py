@@ -190,32 +190,35 @@ OTHERS = [
 
 TEXT = """# Differences from the paper: additions, readings, effect of each
 
-This validation page lists the differences between the defaults of S4A and the paper: additions,
-open points of the paper and their reading here, and the measured effect of each. Equations and
-sections are those of the paper. [The paper's claims](claims.md) are on another page.
+This validation page lists the differences between the defaults of S4A and the paper. They are
+additions of S4A, and S4A's reading of points that the paper leaves open. The effect of each is
+measured. Equation and section numbers are those of the paper. [The paper's claims](claims.md) are
+on another page.
 
-`preset="paper"` switches all additions off: in `s4a.analyse`, `s4a.match_pair`,
-`s4a.register_pairs`, `s4a.compare`, every transfer of an external mesh, and as `--preset paper`.
+`preset="paper"` switches all additions off, in `s4a.analyse`, `s4a.match_pair`,
+`s4a.register_pairs`, `s4a.compare` and every transfer of an external mesh. On the command line it
+is `--preset paper`.
 To run the paper with one addition:
 `s4a.analyse(shapes, **s4a.options.PRESETS["paper"] | {{"refine": "elastic"}})`. A test compares the
-equations with brute force on arrays (`tests/method/test_paper.py`).
+equations with a brute-force implementation (`tests/method/test_paper.py`).
 
-**Data.** Six shapes of about 10,000 vertices, 2,000 at low resolution, all else as in 5.1; all are
-registered to the first.
+**Data.** Each set has six shapes of about 10,000 vertices, 2,000 at low resolution. All other
+settings are as in 5.1. All shapes are registered to the first.
 
-- *brains*: synthetic, in the same pose, each with 10,000 vertices of its own.
-- *faces*: six identities of a published face model (006 to 011; of the earlier ones, 002 is so
-  symmetric that it is flagged as its own mirror image). Vertex i corresponds to vertex i, which
-  favours every nearest-neighbour search. Therefore each face is **remeshed on its own**
-  (PyMeshLab's isotropic remeshing after subdivision, because the remesher otherwise keeps the same
-  vertices of each shape), and the ground truth is interpolated in the common triangles.
+- *brains*: synthetic, in the same pose. Each brain has its own 10,000 vertices.
+- *faces*: six identities of a published face model (006 to 011; 002 is so symmetric that it is
+  flagged as its own mirror image). Vertex i of one face corresponds to vertex i of another, which
+  favours every nearest-neighbour search. Therefore each face is **remeshed separately** by
+  PyMeshLab's isotropic remeshing. Each face is subdivided first, because the remesher otherwise
+  keeps the same vertices of each shape. The ground truth is interpolated in the common triangles.
 - *bodies*: one person in six different poses (FAUST registrations), remeshed in the same way.
 
-**Error.** Mean distance between the image of a template vertex and its true position, over vertices
-and shapes, in % of the square root of the area. It is measured to the *matched* vertex of the shape
-(eq. 4, 7), which cannot be more accurate than the vertex spacing, and to the registered *surface*,
-template + displacement (eq. 8 and the line after it). CPU seconds are of the whole analysis, in one
-run next to another program: differences of less than a fifth have no meaning.
+**Error.** The error is the mean distance between the image of a template vertex and its true
+position, over vertices and shapes, in % of the square root of the area. There are two images: the
+*matched* vertex of the shape (eq. 4, 7), which cannot be more accurate than the vertex spacing, and
+the registered *surface*, template + displacement (eq. 8 and the line after it). CPU seconds are of
+the whole analysis, in one run while another program was running. Differences of less than a fifth
+have no meaning.
 
 `python benchmarks/additions.py --write` measures everything into `docs/differences.csv` and
 writes this page; `python benchmarks/differences.py --write` writes the page only.
@@ -241,9 +244,9 @@ is measured with 2,500 of 10,000 vertices, the same share as 25,000 of 100,000.
 
 ## Single pairs (4.1, 6.2)
 
-The first shape registered to each of the others by `s4a.register_pairs`, with ZoomOut in place
-of Consistent ZoomOut. *Transferred* is the error of 300 vertices of the template transferred
-as landmarks (`s4a.transfer_landmarks`), along both matches of a pair if there are two.
+`s4a.register_pairs` registers the first shape to each of the others, with ZoomOut in place of
+Consistent ZoomOut. For *transferred*, 300 vertices of the template are transferred as landmarks
+(`s4a.transfer_landmarks`), along both matches of a pair if there are two.
 
 {pairs}
 
@@ -260,7 +263,7 @@ Each other reading on top of the paper:
 **The norm of eq. 5.** The paper writes the norm of the Sobolev space $H_0^2$, in which $\\lVert f
 \\rVert = \\lVert \\Lambda^0 f \\rVert$ with the eigenvalues $\\Lambda^0$ of the limit shape. It
 does not say between which spaces $D_i - I$ is an operator. `norm` offers five interpretations.
-The choice decides which shape is the median, and therefore the template, and nothing else.
+The norm decides only which shape is the median, and therefore the template.
 Errors are those of the registration to that median.
 
 {norms}
@@ -395,9 +398,10 @@ def line_of(name):
     declared = DECLARED[name].metadata
     text = declared["help"] if not declared["more"] else f"{declared['help']}. {declared['more']}"
     text = re.sub(r"``|:\w+:(?=`)", lambda mark: "`" if mark[0] == "``" else "", text)
+    text = text[0].upper() + text[1:].replace(".  ", ". ")
     where = f"`{declared['see']}`"
     values = f"`{name}`: {quoted(DEFAULTS[name])}, {quoted(PAPER[name])}{MORE.get(name, '')}"
-    return [declared["section"], declared["instead"], text, where, values]
+    return [declared["section"], declared["instead"] or "not present", text, where, values]
 
 
 def quoted(value):
