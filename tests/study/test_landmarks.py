@@ -129,7 +129,7 @@ def test_names_that_are_there_twice_are_refused_and_points_of_curves_left_out(br
         landmark_closed=[False] * 3,
     )
     assert with_landmarks(template, curve)["guide_name"].values.tolist() == ["a"]
-    with pytest.raises(ValueError, match="different names needed, found none"):
+    with pytest.raises(ValueError, match="unique names needed, found none"):
         with_landmarks(template, curve.isel(landmark=[1, 2]))
 
 
