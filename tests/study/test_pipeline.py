@@ -260,9 +260,7 @@ def test_the_standard_way_runs(brains):
 
 def test_an_unknown_template_is_refused_with_the_names_before_a_shape_is_read(brains, monkeypatch):
     monkeypatch.setattr("s4a.study.pipeline.clean_shape", None)
-    with pytest.raises(
-        ValueError, match="template 'x' is not one of the shapes: brain_01"
-    ):
+    with pytest.raises(ValueError, match="template 'x' is not one of the shapes: brain_01"):
         analyse(brains, template="x", **OPTIONS)
 
 

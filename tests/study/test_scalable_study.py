@@ -198,9 +198,7 @@ def test_what_it_cannot_have_is_refused_by_name(brain_files, tmp_path, capsys):
         Options(method="scalable", refined_eigenfunctions=True)
     words = ["run", str(brain_files[0]), "--out", str(tmp_path / "no"), "--method", "scalable"]
     assert main([*words, "--wrap"]) == 2
-    assert (
-        "has no coarse mesh, and --wrap remeshes another surface" in capsys.readouterr().err
-    )
+    assert "has no coarse mesh, and --wrap remeshes another surface" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main([*words[:-1], "zo"])
     assert Options(method="scalable", preset="paper").refine == "intrinsic"
