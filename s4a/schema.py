@@ -213,7 +213,7 @@ outlier | shape | 1 | whether one of the two is beyond its threshold
 predicted | shape | 1 | class predicted while the shape was left out
 accuracy | fold | 1 | balanced accuracy on the left-out shapes
 # fields on the template
-transferred_field | shape vertex | field | field of the shape, carried to the template
+transferred_field | shape vertex | field | field of the shape, transferred to the template
 # ground truth of a synthetic collection
 reference_point | vertex xyz | 1 | point of the unit sphere that the vertex is the image of
 true_score | shape true_mode | 1 | simulated score of each shape, in standard deviations

@@ -269,21 +269,27 @@ def register_pairs(
     template : path or Dataset
         Mesh file, or clean mesh, such as :func:`s4a.read_shape` returns.
     shapes : dict of str to path or Dataset
+        Name -> mesh file, or clean mesh.
     name : str
         Name of the template.
     n_jobs : int, optional
-        As in joblib; the result does not depend on it.
+        Number of parallel processes, as in joblib: -1 for all cores, None for one.  The result does
+        not depend on it.
     preset : {None, "paper", "fast"}
-        See :func:`s4a.match_pair`; ``"paper"`` also sets bidirectional=False, and blur=0 of
+        Presets of :func:`s4a.match_pair`.  ``"paper"`` also sets bidirectional=False, and blur=0 in
         :func:`s4a.transfer_labels`.
     **options
-        Options of :func:`s4a.match_pair`, and ``bidirectional``: whether each pair is matched in
-        both directions (default), so that transfer averages both.  See :class:`s4a.Options`.
+        Options of :func:`s4a.match_pair`, and ``bidirectional``.  By default, each pair is matched
+        in both directions, and a transfer averages both.  :class:`s4a.Options` describes them.
 
     Returns
     -------
     DataTree
-        ``/original``, ``/registration`` and, with `bidirectional`, ``/reverse``.
+        A study with the nodes
+
+        - ``/original``: meshes of the template and of the shapes;
+        - ``/registration``: registration of each shape to the template;
+        - ``/reverse``: registration of the template to each shape, with `bidirectional`.
 
     Raises
     ------
@@ -293,7 +299,7 @@ def register_pairs(
 
     See Also
     --------
-    s4a.match_pair : Register one pair.
+    s4a.match_pair : Match one pair.
     s4a.analyse : Register a collection by a network.
     s4a.transfer_labels, s4a.transfer_scalars, s4a.transfer_landmarks : Use the registrations.
 
@@ -461,29 +467,32 @@ def transfer_labels(
         Numbers or names at the vertices of the source in ``/original`` (see
         :func:`s4a.input.annotations.labels_of_mesh`).
     source : str or Dataset, optional
-        A shape of the study, by default the template; or an external mesh, which is first matched
-        to the template with the options of the study.
+        Name of a shape of the study, by default the template; or an external mesh.  An external
+        mesh is first matched to the template with the options of the study.
     targets : list of str, optional
-        All other shapes by default.
+        Names of the shapes that receive the labels; by default all other shapes.
     votes : bool
-        Whether to return the share of every label.
+        Also return the share of the votes for every label.
     blur : float, optional
         Radius over which votes are diffused, as a multiple of the estimated match error at each
-        vertex (:func:`s4a.method.register.uncertainty`), so that label borders are smooth where the
+        vertex (:func:`s4a.method.register.uncertainty`).  Diffusion smooths label borders where the
         match is uncertain.  A label that diffusion would remove keeps its vertices.  0, as in the
         paper, disables diffusion.  The default is 1, or 0 with ``preset="paper"`` of the study or
         of an external source.
     **options
-        For an external source: options of :func:`register_pairs`, including ``preset``, which
-        replace those of the study.
+        Options of :func:`register_pairs` for an external source, including ``preset``.  They
+        replace the options of the study.
 
     Returns
     -------
     DataTree
-        For every target ``label(vertex)``, the label with most votes among the corners of the
-        corresponding triangle and their neighbourhood; ``label_share(vertex)``, its share of the
-        votes; ``confidence(vertex)`` of the match; and with `votes`
-        ``label_vote(vertex, label_value)``.
+        A node for every target, with the variables
+
+        - ``label(vertex)``: label with most votes among the corners of the corresponding triangle
+          of the source and their neighbourhood;
+        - ``label_share(vertex)``: share of the votes for that label, from 0 to 1;
+        - ``confidence(vertex)``: confidence of the match, from 0 to 1;
+        - ``label_vote(vertex, label_value)``, with `votes`: share of the votes for every label.
 
     Raises
     ------
@@ -562,15 +571,20 @@ def transfer_scalars(
 
     Parameters
     ----------
-    study, source, targets, **options : see :func:`transfer_labels`
+    study, source, targets, **options
+        As in :func:`transfer_labels`: the study, the shape that the field belongs to, the shapes
+        that receive the field, and options for an external source.
     field : array_like (vertex,)
-        In any unit; NaN has no weight.
+        Numbers at the vertices of the source, in any unit.  NaN has no weight.
 
     Returns
     -------
     DataTree
-        For every target ``field(vertex)``, NaN if over half of the weight is on NaN, and
-        ``confidence(vertex)``.
+        A node for every target, with the variables
+
+        - ``field(vertex)``: transferred field in its unit, NaN if more than half of the weight is
+          on NaN;
+        - ``confidence(vertex)``: confidence of the match, from 0 to 1.
 
     See Also
     --------
@@ -641,26 +655,35 @@ def transfer_landmarks(
 
     Parameters
     ----------
-    study, source, targets, **options : see :func:`transfer_labels`
+    study, source, targets, **options
+        As in :func:`transfer_labels`: the study, the shape that the landmarks belong to, the shapes
+        that receive them, and options for an external source.
     landmarks : path or Dataset
         A landmark file, or a result of :func:`s4a.input.annotations.read_landmarks`.
     farthest : float
-        Largest distance of a landmark from its surface, see :func:`s4a.input.landmarks.locate`.
+        Largest valid distance of a landmark from the surface of the source, as a share of
+        sqrt(area).
 
     Returns
     -------
     DataTree
-        For every target ``landmark_name``, ``landmark_position(landmark, xyz)`` on its surface, in
-        its coordinates, ``landmark_triangle``, ``landmark_barycentric(landmark, corner)``,
-        ``landmark_confidence`` and, if several matches are averaged, ``landmark_disagreement``, the
-        largest distance of one result from the mean; with curves ``landmark_curve`` and
-        ``landmark_closed``, and empty names of added points.
+        A node for every target, with the variables
+
+        - ``landmark_name(landmark)``: names, empty for points added along a curve;
+        - ``landmark_position(landmark, xyz)``: points on the surface of the target, in the
+          coordinates of its mesh;
+        - ``landmark_triangle(landmark)`` and ``landmark_barycentric(landmark, corner)``: triangle
+          and barycentric coordinates of these points;
+        - ``landmark_confidence(landmark)``: confidence of the match, from 0 to 1;
+        - ``landmark_disagreement(landmark)``, if several matches are averaged: largest distance of
+          one of their results from the mean;
+        - ``landmark_curve`` and ``landmark_closed``, with curves: name of the curve of each point,
+          and True if the curve is closed.
 
     Raises
     ------
     ValueError
-        If a landmark is not on the source, a shape is not in the study, or an option is invalid,
-        see :func:`transfer_labels`.
+        If a landmark is not on the source, a shape is not in the study, or an option is invalid.
 
     See Also
     --------

@@ -389,7 +389,7 @@ KINDS = {
     "spacing": (False, "coordinates are rounded to {value:.2f} of an edge (others {usual:.2f}); "
         "export the file with more digits", "export the files with more digits"),
     "kind": (False, "outlier: {what} {deviations:.0f} robust deviations from the median; is it "
-        " another kind of shape, stretched, or only a part? Remove it if it does not belong "
+        "another kind of shape, stretched, or only a part? Remove it if it does not belong "
         "to the collection", "remove the files if they are of another kind"),
     "registration": (True, "registration {sure} (score {registration_error:.3f}{distortion}): "
         "inspect it with s4a view, compare its file with the template's, or remove it",

@@ -275,29 +275,40 @@ def coarsen(
     Parameters
     ----------
     mesh : xarray.Dataset
-        A clean mesh: ``position`` and ``corner_vertex``, manifold, oriented; boundary and several
-        components allowed.
+        A clean mesh with ``position`` and ``corner_vertex``.  It must be manifold and oriented.
+        Boundaries and several components are allowed.
     n_coarse : int
-        Target number of vertices.  The result has between 95 % and 110 % of it, or as many as its
-        topology needs (hundreds of handles, n_coarse in the hundreds).  A mesh without more
-        vertices is returned unchanged.
+        Target number of vertices.  The result has between 95 % and 110 % of it.  A mesh with
+        hundreds of handles may need more if n_coarse is in the hundreds.  A mesh that has no more
+        vertices than n_coarse is returned unchanged.
     wrap : bool
-        Remesh an alpha wrap of the mesh, for scans with irrelevant interior (needs the extra
-        ``s4a[wrap]``).
-    seed, rng : see :mod:`s4a.seeds`
-        The seed selects the first sample; with seed 0 it is an outermost vertex.
+        Remesh an alpha wrap of the mesh.  This is meant for scans whose interior is irrelevant, and
+        needs the extra ``s4a[wrap]``.
+    seed : int
+        Seed that selects the first sample; with seed 0 it is an outermost vertex.
+    rng : int or numpy.random.Generator, optional
+        Replaces `seed`, as in SPEC 7.
 
     Returns
     -------
     xarray.Dataset
-        ``position``, ``corner_vertex``: the coarse mesh, manifold; ``sample_vertex``: its vertices
-        in the original (-1 if not an original vertex); ``edge_vertex``, ``cotan_weight``: W;
-        ``vertex_area``: A, the original vertex areas distributed by U, whose sum is the original
-        area (after wrapping the areas of the coarse mesh); ``coarse_vertex``,
-        ``coarse_weight (original_vertex, corner)``: U, with non-negative rows of sum 1.  Attributes
-        are the numbers of samples, iterations, and vertices removed when handles were cut (U
-        keeps their rows), Euler characteristic, boundary loops, and the kind of Laplacian ("robust"
-        for degenerate triangles).
+        The coarse mesh, its discrete Laplacian and the projection operator:
+
+        - ``position(vertex, xyz)`` and ``corner_vertex(triangle, corner)``: the coarse manifold
+          mesh, in the unit of the input;
+        - ``sample_vertex(vertex)``: vertex of the original mesh for each coarse vertex, -1 if it is
+          not an original vertex;
+        - ``edge_vertex`` and ``cotan_weight``: edges and cotangent weights of the stiffness matrix
+          W;
+        - ``vertex_area(vertex)``: diagonal of the area matrix A.  The original vertex areas are
+          distributed by U, so their sum is the original area.  With `wrap` they are the areas of
+          the coarse mesh;
+        - ``coarse_vertex`` and ``coarse_weight (original_vertex, corner)``: nonzero entries of U.
+          The entries are not negative, and each row has the sum 1.
+
+        The attributes are the numbers of samples, iterations, boundary loops and vertices removed
+        with handles that were cut, the Euler characteristic, and the kind of Laplacian ("robust"
+        for degenerate triangles).  U keeps the rows of removed vertices.
 
     Raises
     ------
@@ -312,14 +323,14 @@ def coarsen(
     Notes
     -----
     The weights of a vertex come from the coarse triangles around the sample of its geodesic Voronoi
-    cell, so U never crosses a thin wall.  Handles and holes inside one cell are lost; handles about
-    as thin as a cell are cut only if they would need more than 1.1 n_coarse samples.
+    cell, so U never crosses a thin wall.  Handles and holes inside one cell are lost.  Handles that
+    are about as thin as a cell are cut only if they would need more than 1.1 n_coarse samples.
 
     References
     ----------
-    Maggioli, F. et al. (2024). ReMatching: low-resolution representations for scalable shape
-    correspondence. ECCV.
-    Sharp, N. and Crane, K. (2020). A Laplacian for nonmanifold triangle meshes. Computer Graphics
+    F. Maggioli et al. (2024), ReMatching: low-resolution representations for scalable shape
+    correspondence, ECCV.
+    N. Sharp and K. Crane (2020), A Laplacian for nonmanifold triangle meshes, Computer Graphics
     Forum 39(5).
 
     Examples

@@ -76,9 +76,10 @@ def align_pair(source: xr.Dataset, target: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        ``rotation`` R and ``translation`` t of R x + t, between the frames of both shapes: centred,
-        with the square root of the area as unit.  The attribute ``residual`` is the trimmed root
-        mean square distance of the pairs, in the same unit.
+        ``rotation`` R and ``translation`` t of the rigid transform R x + t.  Both shapes are
+        centred and scaled to unit area before, so lengths are in multiples of sqrt(area).  The
+        attribute ``residual`` is the trimmed root mean square distance of the nearest-neighbour
+        pairs, in the same unit.
 
     Raises
     ------
@@ -91,7 +92,7 @@ def align_pair(source: xr.Dataset, target: xr.Dataset) -> xr.Dataset:
 
     References
     ----------
-    Besl, P. J. and McKay, N. D. (1992). A method for registration of 3-D shapes. IEEE TPAMI 14.
+    P. J. Besl and N. D. McKay (1992), A method for registration of 3-D shapes, IEEE TPAMI 14(2).
 
     Examples
     --------
@@ -179,15 +180,32 @@ def build_network(
     ----------
     coarse : dict of str to xarray.Dataset
         Name -> low-resolution mesh with its spectrum.
-    n_pairs, k_init, init, initial_refinement, n_samples : see :func:`map_pairs`
+    n_pairs : int
+        Number of pairs in the network; all pairs if there are fewer.
+    k_init : int
+        Size of the initial functional maps.
+    init : {"dense", "landmarks"}
+        Fit initial maps to all nearest neighbours, or to 10 landmarks as in the paper.
+    initial_refinement : bool
+        Refine the initial maps by one ZoomOut iteration (4.2).
+    n_samples : int
+        Number of farthest-point samples for which that iteration searches matches if pose
+        differences are small; 0 for all vertices.
 
     Returns
     -------
     xarray.Dataset
-        ``source(pair)``, ``target(pair)``, ``fmap_initial(pair, eigenpair_target_initial,
-        eigenpair_source_initial)``, both directions of each pair, and the other variables of
-        :func:`map_pairs`; ``icp_rotation(shape, xyz, xyz_2)`` and ``icp_translation(shape, xyz)``
-        onto the shape in the attribute ``reference``.
+        The network has two maps for each pair, one per direction, so the dimension ``pair`` counts
+        each pair twice.
+
+        - ``source(pair)`` and ``target(pair)``: names of the shapes;
+        - ``fmap_initial(pair, eigenpair_target_initial, eigenpair_source_initial)``: initial maps;
+        - ``fmap_fitted``: initial maps before their ZoomOut iteration;
+        - ``pair_rotation`` and ``pair_translation``: rigid transform of each pair by ICP;
+        - ``landmark_of_source(pair, landmark)`` and ``landmark_of_target``: vertices of the
+          landmarks, with ``init="landmarks"``;
+        - ``icp_rotation(shape, xyz, xyz_2)`` and ``icp_translation(shape, xyz)``: rigid transform
+          of each shape onto the shape that the attribute ``reference`` names.
 
     Raises
     ------
@@ -201,8 +219,8 @@ def build_network(
 
     References
     ----------
-    Ovsjanikov, M. et al. (2012). Functional maps: a flexible representation of maps between shapes.
-    ACM TOG 31(4).
+    M. Ovsjanikov et al. (2012), Functional maps: a flexible representation of maps between shapes,
+    ACM Transactions on Graphics 31(4).
 
     Examples
     --------
@@ -282,27 +300,31 @@ def refine_network(
         Name -> low-resolution mesh with its spectrum.
     initial : xarray.Dataset
         Network of :func:`build_network`.
-    k, step, n_latent, weights, n_samples, dense_iterations, norm, keep_iterations : see
-    :func:`s4a.analyse`
+    k, step, n_latent, weights, n_samples, dense_iterations, norm, keep_iterations
+        Options of Consistent ZoomOut and of the median shape.  :class:`s4a.Options` describes them.
     n_jobs : int
-        Threads; the result does not depend on it.
+        Number of threads, as in joblib: -1 for all cores.  The result does not depend on it.
     progress : callable, optional
         Called with the size of the maps after each iteration.
 
     Returns
     -------
     xarray.DataTree
-        ``/network`` with ``fmap``, ``weight``, ``cycle_error`` and ``cycle_error_initial``;
-        ``/latent`` with ``latent_basis``, ``latent_eigenvalue`` and the variables and attribute
-        ``median`` of :func:`s4a.method.median.median_shape`; with `keep_iterations`
-        ``/iterations/k_020`` and so on, with the ``fmap``, ``latent_basis`` and
-        ``latent_eigenvalue`` of every size.
+        The refined network, with the nodes
+
+        - ``/network``: the refined maps ``fmap``, their ``weight``, and the errors ``cycle_error``
+          and ``cycle_error_initial`` of the refined and the initial maps;
+        - ``/latent``: ``latent_basis``, ``latent_eigenvalue``, shape differences and
+          ``distance_to_limit(shape)``, see :func:`s4a.method.median.median_shape`.  The attribute
+          ``median`` is the name of the median shape;
+        - ``/iterations/k_020`` and so on, with `keep_iterations`: ``fmap``, ``latent_basis`` and
+          ``latent_eigenvalue`` for every size of the maps.
 
     Raises
     ------
     ValueError
-        If a mesh or the network lacks a variable, or an option is out of range: k must be at least
-        the size of the initial maps, and at most half of `n_samples` unless that is 0.
+        If a mesh or the network lacks a variable, or an option is out of range.  k must be at least
+        the size of the initial maps, and at most half of `n_samples` unless `n_samples` is 0.
 
     See Also
     --------
@@ -311,9 +333,9 @@ def refine_network(
 
     References
     ----------
-    Melzi, S. et al. (2019). ZoomOut: spectral upsampling for efficient shape correspondence. ACM
-    TOG 38(6).
-    Huang, R. et al. (2020). Consistent ZoomOut: efficient spectral map synchronization. Computer
+    S. Melzi et al. (2019), ZoomOut: spectral upsampling for efficient shape correspondence, ACM
+    Transactions on Graphics 38(6).
+    R. Huang et al. (2020), Consistent ZoomOut: efficient spectral map synchronization, Computer
     Graphics Forum 39(5).
 
     Examples
@@ -548,14 +570,15 @@ def latent_match(
     source, target : str
         Names of shapes.
     dense_match : {"latent", "fmap"}
-        Match at full resolution: eq. 7, or eq. 4 with the functional map of the match of eq. 3.
+        Match at full resolution by the latent bases (eq. 7); or by eq. 4, with the functional map
+        that eq. 3 gives.
     full : bool
-        Whether to match original vertices, or those of low resolution by eq. 3.
+        If True, match original vertices.  If False, match low-resolution vertices by eq. 3.
 
     Returns
     -------
     xarray.Dataset
-        ``match(vertex)``: on each vertex of the target, the matched vertex of the source.
+        ``match(vertex)``: matched vertex of the source for each vertex of the target.
 
     Raises
     ------
@@ -600,7 +623,8 @@ def latent_map(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        ``fmap(eigenpair_target, eigenpair_source)``.
+        ``fmap(eigenpair_target, eigenpair_source)``: the matrix C that maps coefficients of
+        functions on the source to coefficients on the target.
 
     Raises
     ------
@@ -642,28 +666,44 @@ def register_shape(
     Parameters
     ----------
     study : xarray.DataTree
-        With ``/original``, ``/coarse`` and ``/latent``.  Defaults are taken from ``/network``,
-        ``/registration`` and ``/report`` if it has them.
+        With ``/original``, ``/coarse`` and ``/latent``.  Defaults of the other parameters are taken
+        from ``/network``, ``/registration`` and ``/report`` if the study has these nodes.
     name : str
         Name of the shape.
     template : str, optional
         By default the template of the study, or the median shape if nothing is registered yet.
     initial_transform : tuple (R, t), optional
-        Approximate rigid transform of the shape onto the template, between their frames (centred,
-        of unit area).  By
-        default the alignment of the network; if there is none, ICP from the principal axes.
+        Approximate rigid transform R x + t of the shape onto the template.  Both are centred and
+        scaled to unit area.  The default is the alignment of the network, or ICP from the principal
+        axes if there is none.
     dense_match : {"latent", "fmap"}, optional
-        Match by the latent bases (eq. 7), or by functional maps (eq. 3 and 4).
+        Match by the latent bases (eq. 7), or by functional maps (eq. 3 and 4).  By default as in
+        the report of the study.
     **options
-        ``refine``, ``remove_size``, ``articulated`` and ``alignment`` of
-        :func:`s4a.method.register.register`; ``n_projected`` and ``area_weighted`` of
-        :class:`s4a.method.shape.Shape`.  Options that are missing or None, `dense_match` too, are
-        those of the study's report, else the defaults of these functions.
+        ``refine``, ``remove_size``, ``articulated``, ``alignment``, ``n_projected`` and
+        ``area_weighted``.  :class:`s4a.Options` describes them.  Options that are missing or None
+        have the values in the report of the study, or their defaults if there is no report.
 
     Returns
     -------
     xarray.Dataset
-        Registration of :func:`s4a.method.register.register`.
+        Displacements are in the frame of the template and in the unit of the input.
+
+        - ``registered_match(vertex)``: matched vertex of the shape for each vertex of the template;
+        - ``displacement(vertex, xyz)``: displacement of the template, and ``displacement_raw``, the
+          same before smoothing;
+        - ``registered_match_low(low_vertex)`` and ``displacement_low``: match by eq. 6 and its
+          displacement at low resolution;
+        - ``displacement_coefficient(eigenpair, xyz)``: projection of the displacement onto U Phi of
+          the template;
+        - ``icp_rotation`` and ``icp_translation``: rigid transform by ICP;
+        - ``rotation``, ``translation`` and ``scale``: alignment of the shape to the template;
+        - ``confidence(vertex)``: confidence of the match, from 0 to 1, computed from ``round_trip``
+          and ``distortion``;
+        - ``template_triangle(original_vertex)`` and ``template_barycentric``: triangle and
+          barycentric coordinates on the template for each vertex of the shape.
+
+        The attribute ``initialisation`` is the name of the initialisation with the best ``score``.
 
     Raises
     ------
@@ -680,8 +720,8 @@ def register_shape(
 
     References
     ----------
-    Amberg, B., Romdhani, S. and Vetter, T. (2007). Optimal step nonrigid ICP algorithms for surface
-    registration. CVPR.
+    B. Amberg, S. Romdhani and T. Vetter (2007), Optimal step nonrigid ICP algorithms for surface
+    registration, CVPR.
 
     Examples
     --------

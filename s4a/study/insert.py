@@ -73,28 +73,35 @@ def insert(
     Parameters
     ----------
     study : DataTree
-        See :func:`s4a.analyse` and :func:`s4a.open_study`.
+        A finished study, from :func:`s4a.analyse` or :func:`s4a.open_study`.
     shapes : path, list of paths, dict or Dataset
-        See :func:`s4a.read_shapes`; a single mesh Dataset is named ``new``.
+        The new shapes, in any form that :func:`s4a.read_shapes` accepts.  A single mesh Dataset is
+        named ``new``.
     landmarks : path, optional
-        Folder with landmark files, see :func:`s4a.analyse`.
+        Folder with landmark files, named as the shapes.  By default no landmarks are used.
     reflect : str or list of str, optional
-        Names of new shapes to mirror, separated by commas, or ``"auto"`` for those with the
-        opposite chirality of the study.  By default none is mirrored.
+        Names of new shapes to mirror, separated by commas.  ``"auto"`` mirrors the shapes whose
+        chirality is opposite to that of the study.  By default no shape is mirrored.
     compare : bool
         Compare each new shape with the study in unit, chirality, form and genus, and warn about
         suspect ones in ``/report``.
     n_jobs : int, optional
-        Processes, as in joblib; the result does not depend on it.
+        Number of parallel processes, as in joblib: -1 for all cores, None for one.  The result does
+        not depend on it.
 
     Returns
     -------
     DataTree
-        A study of the new shapes: ``/original``, with the template's mesh too, ``/coarse``,
-        ``/registration`` to the template with ``confidence(shape, vertex)``; ``/latent`` with
-        ``latent_basis(shape, eigenpair, latent)``, shape differences and
-        ``distance_to_limit(shape)``; ``/pca`` with the modes of the study, ``score(shape,
-        component)`` and ``reconstruction_error(shape)``; ``/report``.
+        A study of the new shapes, with the nodes
+
+        - ``/original``: clean meshes of the new shapes and of the template;
+        - ``/coarse``: their low-resolution meshes;
+        - ``/registration``: registrations to the template, with ``confidence(shape, vertex)``;
+        - ``/latent``: ``latent_basis(shape, eigenpair, latent)``, the shape differences and
+          ``distance_to_limit(shape)``;
+        - ``/pca``: the modes of the study, with ``score(shape, component)`` and
+          ``reconstruction_error(shape)`` of the new shapes;
+        - ``/report``: status and warnings of each new shape.
 
     Raises
     ------
@@ -104,8 +111,8 @@ def insert(
 
     See Also
     --------
-    analyse : analyse a collection.
-    register_pairs : register pairs of shapes of a study.
+    analyse : Analyse a collection.
+    register_pairs : Register a template to each shape without a network.
 
     Examples
     --------

@@ -22,46 +22,57 @@ log = logging.getLogger(__name__)
 def match_pair(
     source: Mesh, target: Mesh, *, preset: str | None = None, **options: Any
 ) -> xr.Dataset:
-    """Correspondence of two shapes at full resolution (4.1).
+    """Match two shapes at full resolution (4.1).
 
-    If poses differ much, the search for an initial map takes several seconds more.  With more than
-    two shapes, a network (:func:`s4a.analyse`) is more reliable.  Landmarks
-    (:func:`s4a.with_landmarks`) guide every step.
+    If poses differ a lot, the search for an initial map takes several seconds more.  For more than
+    two shapes, a network (:func:`s4a.analyse`) is more reliable.  Landmarks added by
+    :func:`s4a.with_landmarks` guide every step.
 
     Parameters
     ----------
     source, target : path or xarray.Dataset
         Mesh files, or clean meshes, such as :func:`s4a.read_shape` returns.
     preset : {None, "paper", "fast"}
-        ``"paper"`` uses the method of 4.1 without additions, ``"fast"`` sets n_coarse=3000.
+        ``"paper"`` uses the method of 4.1 without additions; ``"fast"`` sets n_coarse=3000.  None
+        uses the defaults of S4A.
     **options
         ``n_coarse, k_init, k, step, init, initial_refinement, full_resolution_iterations, refine,
         articulated, refined_eigenfunctions, alignment, area_weighted, n_projected, method, seed``
-        or ``rng``: see :class:`s4a.Options`.
+        or ``rng``.  :class:`s4a.Options` describes them and has their defaults.
 
     Returns
     -------
     xarray.Dataset
-        ``match(vertex)``, the matched vertex of the source for each vertex of the target;
-        ``displacement(vertex, xyz)`` from the target to the source after rigid alignment (unit of
-        the input); ``template_triangle(original_vertex)`` and ``template_barycentric``, the inverse
-        match from vertices of the source to points of the target;
-        ``fmap(eigenpair_target, eigenpair_source)`` after ZoomOut, ``fmap_initial``, and
-        ``fmap_fitted``, the initial map before its ZoomOut step; with landmarks
-        ``landmark_of_source(landmark)``, ``landmark_of_target``; and the other variables of
-        :func:`s4a.method.register.register`.  Attributes: ``score``
-        (:func:`s4a.method.spectral_icp.registration_score`), ``initialisation``, ``initial_map``
-        ("landmarks", "dense", "icp", "hks" or "wks"), and ``note`` if k was reduced.
+        The target takes the role of the template.  The main variables are
+
+        - ``match(vertex)``: matched vertex of the source for each vertex of the target;
+        - ``displacement(vertex, xyz)``: from the target to the source after rigid alignment, in the
+          unit of the input;
+        - ``template_triangle(original_vertex)`` and ``template_barycentric``: inverse match, the
+          triangle and barycentric coordinates on the target for each vertex of the source;
+        - ``fmap(eigenpair_target, eigenpair_source)``: functional map after ZoomOut;
+        - ``fmap_initial``: initial functional map;
+        - ``fmap_fitted``: initial functional map before its ZoomOut iteration;
+        - ``landmark_of_source(landmark)`` and ``landmark_of_target``: vertices of the landmarks, if
+          the initial map was fitted to landmarks.
+
+        :func:`s4a.method.register.register` describes the other variables.  The attributes are
+
+        - ``score``: registration score, lower is better
+          (:func:`s4a.method.spectral_icp.registration_score`);
+        - ``initialisation``: name of the initialisation with the best score;
+        - ``initial_map``: method of the initial map, "landmarks", "dense", "icp", "hks" or "wks";
+        - ``note``: the reduced k, if k was reduced.
 
     Raises
     ------
     ValueError
-        If a mesh lacks variables or an option is out of range, see :func:`s4a.analyse`.
+        If a mesh lacks variables, or an option is out of range or contradicts the preset.
 
     See Also
     --------
-    analyse : analyse a collection.
-    compare : compare matching algorithms on a pair.
+    analyse : Analyse a collection.
+    compare : Compare matching algorithms on a pair.
 
     References
     ----------

@@ -93,22 +93,32 @@ def analyse(
         A folder, a glob pattern or a list of files; a dict from names to files, Datasets or
         ``(points, triangles)``; or the tree that :func:`s4a.read_shapes` returns.
     preset, n_coarse, n_pairs, k, label, reflect, table, landmarks, template, remove_size
-        The most used options, see :class:`s4a.Options`.  None means the value of `options`, or the
-        default.
+        The most used options.  :class:`s4a.Options` describes them.  None means the value in
+        `options`, or the default.
     options : Options, optional
         Options that replace the defaults.
     **others
         All other options of :class:`s4a.Options`.  ``rng`` can replace ``seed``.
     store : path, optional
-        Folder of the study.  A run that was interrupted resumes at the first missing file.
+        Folder of the study.  A run that was interrupted resumes at the first missing file.  By
+        default nothing is stored.
     n_jobs : int, optional
-        Processes, as in joblib: -1 for all available cores.  The result does not depend on it.
+        Number of parallel processes, as in joblib: -1 for all cores, None for one.  The result does
+        not depend on it.
 
     Returns
     -------
     xarray.DataTree
-        The study: ``/original``, ``/coarse``, ``/network``, ``/latent``, ``/registration``,
-        ``/pca``, ``/report`` and, with a table, ``/subjects``.
+        The study, with the nodes
+
+        - ``/original``: clean meshes;
+        - ``/coarse``: low-resolution meshes with their eigenfunctions;
+        - ``/network``: functional maps between pairs of shapes;
+        - ``/latent``: latent bases, shape differences and the median shape;
+        - ``/registration``: displacement of the template to every shape;
+        - ``/pca``: modes of variation and scores;
+        - ``/report``: status, warnings and run times;
+        - ``/subjects``: columns of the table, if there is a table.
 
     Raises
     ------
@@ -120,10 +130,10 @@ def analyse(
 
     See Also
     --------
-    read_shapes : read and check a collection only.
-    open_study : open the folder of a study.
-    insert : insert new shapes into a study.
-    match_pair : register a pair of shapes.
+    read_shapes : Read and check a collection only.
+    open_study : Open the folder of a study.
+    insert : Insert new shapes into a study.
+    match_pair : Match a pair of shapes.
 
     References
     ----------

@@ -165,9 +165,9 @@ class Reader:
 def open_study(folder: Path | str) -> xr.DataTree:
     """Open a study folder, finished or not.
 
-    Variables are read when they are used, those of ``/registration`` for the selected shapes only;
-    no file is kept open.  Stages that are not yet computed are absent.  Files that do not match the
-    others in the folder are skipped with a warning.
+    Variables are read when they are used, and variables of ``/registration`` only for the selected
+    shapes.  No file is kept open.  Stages that are not yet computed are absent.  Files that do not
+    match the others in the folder are skipped with a warning.
 
     Every file is verified by its checksums (:mod:`s4a.study.netcdf`) and against the schema
     (:mod:`s4a.study.contents`).  Links in the folder, and references of HDF5 to other files, are
@@ -176,24 +176,25 @@ def open_study(folder: Path | str) -> xr.DataTree:
     Parameters
     ----------
     folder : path
-        Folder given to ``store=`` or ``s4a run --out``.
+        Folder that was given as ``store=`` to :func:`s4a.analyse`, or as ``--out`` to ``s4a run``.
 
     Returns
     -------
     xarray.DataTree
+        The study, with the nodes that :func:`s4a.analyse` returns, as far as they are computed.
 
     Raises
     ------
     ValueError
         If the folder is not a study.
     DamagedError
-        If a file is damaged (an OSError); the message has the file and the remedy.  Larger
-        variables are checked when they are read.
+        If a file is damaged.  The message has the file and the remedy.  Larger variables are
+        checked when they are read.  DamagedError is an OSError.
 
     See Also
     --------
-    analyse : compute a study.
-    verify : check all files of a study.
+    analyse : Compute a study.
+    verify : Check all files of a study.
 
     Examples
     --------

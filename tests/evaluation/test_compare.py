@@ -196,7 +196,7 @@ def test_small_meshes_are_compared_in_as_many_functions_as_they_have_and_a_note_
         found = compare(source, target, n_geodesic=20)
         assert found["algorithm"].values.tolist() == list(comparison.METHODS)
         assert np.isfinite(found["chamfer"]).all()
-        note = "pair: k = 100 reduced to 58, the eigenfunctions that the smaller mesh has"
+        note = "pair: k = 100 reduced to 58, the number of eigenfunctions of the smaller mesh"
         assert found.attrs["note"] == note
         assert note in caplog.text
     itself = compare(few, few, truth=np.arange(60), n_geodesic=20)

@@ -223,7 +223,7 @@ def test_where_the_truth_is_unknown_nothing_is_measured(ball, shuffled):
         metrics.evaluate(ball, ball, match, truth=np.full(n, -1))
 
 
-def test_evaluations_stack_over_ways_and_pairs(ball, shuffled):
+def test_evaluations_stack_over_algorithms_and_pairs(ball, shuffled):
     same = np.arange(len(shuffled))
     rows = [
         xr.concat(
@@ -232,7 +232,7 @@ def test_evaluations_stack_over_ways_and_pairs(ball, shuffled):
         for _ in range(2)
     ]
     table = xr.concat(rows, "pair")
-    assert dict(table["chamfer"].sizes) == {"pair": 2, "way": 2}
+    assert dict(table["chamfer"].sizes) == {"pair": 2, "algorithm": 2}
     assert table["chamfer"].attrs["units"] == "share of sqrt(area)"
     assert (
         table["geodesic_error"].isel(algorithm=0) < table["geodesic_error"].isel(algorithm=1)

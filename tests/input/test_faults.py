@@ -213,7 +213,7 @@ def test_a_suspect_new_shape_is_reported(reference):
     names = report["shape"].values.tolist()
     warning = dict(zip(names, report["warning"].values, strict=True))
     assert warning["good"] == ""
-    assert "near 10^-3: another unit" in warning["metres"]
+    assert "near 10^-3: are its coordinates in another unit" in warning["metres"]
     assert "fits as a mirror image" in warning["mirrored"]
     assert warning["upside_down"] == ""  # the alignment turns it
     assert "near 10" not in warning["mirrored"]

@@ -120,7 +120,7 @@ def test_three_landmarks_on_a_line_say_nothing_of_turns_about_it():
 
 def test_names_that_are_there_twice_are_refused_and_points_of_curves_left_out(brains):
     (template, _), (on_template, _) = brains
-    with pytest.raises(ValueError, match="different names needed, found 'a' 2 times"):
+    with pytest.raises(ValueError, match="unique names needed, found 'a' 2 times"):
         with_landmarks(template, points(on_template[:2], "aa"))
     curve = dataset(
         landmark_name=["a", "", ""],
@@ -129,7 +129,7 @@ def test_names_that_are_there_twice_are_refused_and_points_of_curves_left_out(br
         landmark_closed=[False] * 3,
     )
     assert with_landmarks(template, curve)["guide_name"].values.tolist() == ["a"]
-    with pytest.raises(ValueError, match="different names needed, found none"):
+    with pytest.raises(ValueError, match="unique names needed, found none"):
         with_landmarks(template, curve.isel(landmark=[1, 2]))
 
 
@@ -146,7 +146,7 @@ def test_a_folder_of_landmarks_is_read_by_the_names_of_shapes(tmp_path):
     with pytest.raises(ValueError, match=r"landmarks: one file for head needed; found .*head\.csv"):
         files_named(tmp_path, ["head"], "landmarks", SUFFIXES)
     with pytest.raises(
-        ValueError, match=r"named as a shape, such as foot with one of .*\.mrk\.json"
+        ValueError, match=r"named after a shape, such as foot with one of .*\.mrk\.json"
     ):
         files_named(tmp_path, ["foot"], "landmarks", SUFFIXES)
     with pytest.raises(ValueError, match="landmarks: a folder of files"):

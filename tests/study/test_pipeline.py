@@ -216,7 +216,7 @@ def test_a_killed_run_resumes(brain_files, study_of_files, tmp_path):
     ) as run:
         deadline = time.monotonic() + 60
         while (
-            not any((work / "network").glob("motion_*.nc"))
+            not any((work / "network").glob("alignment_*.nc"))
             and run.poll() is None
             and time.monotonic() < deadline
         ):
@@ -260,7 +260,7 @@ def test_the_standard_way_runs(brains):
 
 def test_an_unknown_template_is_refused_with_the_names_before_a_shape_is_read(brains, monkeypatch):
     monkeypatch.setattr("s4a.study.pipeline.clean_shape", None)
-    with pytest.raises(ValueError, match="template 'x' is none of the shapes: brain_01, brain_02"):
+    with pytest.raises(ValueError, match="template 'x' is not one of the shapes: brain_01"):
         analyse(brains, template="x", **OPTIONS)
 
 
@@ -343,7 +343,7 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(arrays):
     [
         ({"init": "random"}, r"init must be one of 'dense', 'landmarks'; found 'random'"),
         ({"refine": 1}, r"refine must be one of 'elastic', 'spectral_icp', 'intrinsic'"),
-        ({"dense_match": "mine"}, r"how must be one of 'ours', 'standard'"),
+        ({"dense_match": "mine"}, r"dense_match must be one of 'latent', 'fmap'"),
         ({"norm": "l2"}, r"norm must be one of 'h2', 'h1', 'frobenius', 'h2_image'"),
         ({"preset": "best"}, r"preset must be one of None, 'paper'"),
         ({"n_coarse": 99}, r"n_coarse must be an integer of at least 100; found 99"),
@@ -397,7 +397,7 @@ def test_an_option_out_of_range_is_refused_with_the_legal_range_before_a_shape_i
 
 def test_names_that_would_nest_are_refused(arrays):
     X, T = arrays["brain_01"]
-    with pytest.raises(ValueError, match=r"and -, at most 100 of them; found \['a/b'\]"):
+    with pytest.raises(ValueError, match=r"1 to 100 letters, digits, _ or -; found \['a/b'\]"):
         analyse({"a/b": (X, T), "c": (X, T)}, **OPTIONS)
 
 

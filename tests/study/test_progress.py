@@ -109,4 +109,4 @@ def test_a_note_of_another_form_is_refused(tmp_path, text):
 
 def test_a_folder_without_a_run_is_an_error(tmp_path, capsys):
     assert cli.main(["status", str(tmp_path)]) == 2
-    assert "no run of this version of s4a has begun there" in capsys.readouterr().err
+    assert "no run of this version of s4a was started there" in capsys.readouterr().err

@@ -438,7 +438,7 @@ def test_verify_prints_one_line_and_has_an_exit_code(folder, capsys):
     first, *lines = capsys.readouterr().out.splitlines()
     assert "1 damaged" in first
     assert "1 missing" in first
-    assert "the same `s4a run` again makes what is wrong again" in first
+    assert "run the same `s4a run` again to compute these files again" in first
     assert sorted(line.split(",")[0].strip() for line in lines) == [
         "network/alignment_brain_04.nc",
         "notes.txt",

@@ -191,7 +191,7 @@ def test_structures_are_hidden_and_coloured_and_their_poses_moved(page):
     before = pixels(views(panel).first)
     panel.get_by_label("right", exact=True).uncheck()
     hidden = redrawn(views(panel).first, before)
-    panel.get_by_label("the colour of left").evaluate(
+    panel.get_by_label("colour of left").evaluate(
         "(i) => { i.value = '#00ff00'; i.dispatchEvent(new Event('change', { bubbles: true })); }"
     )
     coloured = redrawn(views(panel).first, hidden)

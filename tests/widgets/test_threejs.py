@@ -86,7 +86,7 @@ def test_the_table_holds_positions_and_normals_of_the_modes(study):
     assert np.quantile(turned, 0.05) > 0.97
     still = threejs.modes(study).geometry.attributes["normal"].array[::7]
     unturned = np.einsum("nx,nx->n", still, normals[::7])
-    assert np.mean(turned) > np.mean(unturned), "nearer to the truth than the mean's normals"
+    assert np.mean(turned) > np.mean(unturned), "more accurate than the mean's normals"
 
 
 def test_pythreejs_takes_no_list_of_the_scores_for_a_vector_or_a_matrix(study):
