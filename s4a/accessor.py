@@ -51,7 +51,7 @@ def explore(
 
     Examples
     --------
-    With a study of six  small brains:
+    With a study of six small brains:
 
     >>> import s4a
     >>> study = s4a.synthetic.example_study()

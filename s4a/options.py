@@ -250,12 +250,13 @@ class Options:
     preset: str | None = computing(None,
         "'paper' switches off all additions to the published method; 'fast' halves the time",
         choices=("paper", "fast"), pair=True,
-        more="Errors of 'fast' are about a tenth larger (``benchmarks/cheaper.py``).  A value that "
-        "contradicts the preset is refused; to add one thing to the paper, pass "
-        '``s4a.options.PRESETS["paper"]`` with that entry changed')
+        more="The default, None, uses all additions.  Errors of 'fast' are about a tenth larger "
+        "(``benchmarks/cheaper.py``).  A value that contradicts the preset is refused.  To change "
+        'one entry of a preset, pass ``s4a.options.PRESETS["paper"]`` with that entry changed')
     seed: int = computing(0, "seed of all random numbers", of="low resolution", pair=True,
-        more="Or ``rng``, see :mod:`s4a.seeds`")
-    pattern: str | None = reading(None, "read only files whose name matches, such as '*brain*'")
+        more="``rng``, an integer or a ``numpy.random.Generator``, can replace it")
+    pattern: str | None = reading(None,
+        "read only files whose name matches a pattern, such as '*brain*'")
     components: str | int = reading("largest",
         "connected components to keep of each mesh: 'largest', 'all' or a number",
         check=check_components, of="cleaning")
@@ -263,87 +264,106 @@ class Options:
         "exclude shapes with non-finite vertices instead of repairing them", of="cleaning")
     close_holes: bool = reading(False, "close each hole with a fan of triangles", of="cleaning")
     label: int | str | None = reading(None,
-        "the files are label volumes (NIfTI, MGH): extract the surface of this label, or of the "
-        "union of several (1,2)",
-        check=check_label, of="cleaning", more='Or of ``"all"``, see :func:`s4a.read_labels`')
+        "extract the surface of this label, or of the union of several (1,2), from label volumes "
+        "(NIfTI, MGH)",
+        check=check_label, of="cleaning", more='``"all"`` means every label but 0, see '
+        ":func:`s4a.read_labels` for the formats.  By default the files are meshes")
     reflect: str | list[str] | None = reading(None,
         "shapes to mirror: names separated by commas, COLUMN=VALUE of the table, or 'auto'",
         more="Mirroring maps x to -x in the coordinates of the file and reverses the triangles, so "
-        "that left and right shapes get the same chirality.  A column may also hold 1 and 0.  "
+        "that left and right shapes get the same chirality.  A column of yes and no needs no "
+        "value.  "
         "``auto`` mirrors the shapes of the rarer chirality, found by pairwise ICP of the shapes "
         "and of their mirror images (:func:`s4a.input.chirality.mirrored_shapes`).  ``/report`` "
         "says for each shape whether it was mirrored")
     table: Path | str | None = reading(None,
         "CSV file with a column 'shape', covariates and groups for the statistics",
-        more="See :func:`s4a.input.subjects.read_table`; the columns become ``/subjects``.  "
-        "Nothing else depends on them.  Without a table, that of an earlier run is kept")
+        more="The columns are stored in ``/subjects``; :func:`s4a.input.subjects.read_table` "
+        "describes the format.  Only ``reflect`` and the statistics use the table.  Without a "
+        "table, the table of an earlier run is kept")
     landmarks: Path | str | None = reading(None,
         "folder of landmark files, named as the shapes, that guide registration",
-        more="3D Slicer (.mrk.json), CSV or MeshLab (.pp), for all shapes or some.  Landmarks of "
-        "the same name attract each other, see :func:`s4a.with_landmarks` for meshes in memory")
+        more="The formats are 3D Slicer (.mrk.json), CSV and MeshLab (.pp).  Shapes without a file "
+        "have no landmarks.  Landmarks of two shapes are paired by name.  "
+        ":func:`s4a.with_landmarks` adds landmarks to a mesh in memory")
     features: str | list[str] | None = reading(None,
-        "scalar fields that guide registration, separated by commas: sulc is read from "
-        "a.sulc.npy next to a.ply",
-        more="Or from a.sulc, or a PLY property (:func:`s4a.input.annotations.feature_files`); see "
-        ":func:`s4a.with_features` for meshes in memory")
+        "names of scalar fields that guide registration, separated by commas; the field sulc of "
+        "a.ply is read from a.sulc.npy",
+        more="A file a.sulc or a property of the PLY file are read, too "
+        "(:func:`s4a.input.annotations.feature_files`).  :func:`s4a.with_features` adds fields to "
+        "a mesh in memory")
     method: str = network("rematch",
-        "low resolution by remeshing (ReMatching) or by the local functions of SCALABLE",
+        "low-resolution shapes: remeshed surfaces (rematch) or local functions (scalable)",
         choices=("rematch", "scalable"), section="4.1", see="method/scalable", of="low resolution",
         pair=True,
-        more="The study has the same nodes and variables except U.  With SCALABLE the coarse "
-        "vertices are samples, joined by an edge where their cells meet.  "
+        more="The methods are ReMatching and SCALABLE.  Both give the same nodes and variables, "
+        "but SCALABLE has no U.  Its coarse vertices are samples, joined by an edge where their "
+        "cells meet.  "
         "``refined_eigenfunctions`` and ``wrap`` need a coarse mesh and are refused")
     n_coarse: int = network(N_COARSE, "number of vertices of the low-resolution meshes", least=100,
         fast=3000, section="4.1", of="low resolution", pair=True,
-        more="With SCALABLE, the number of samples.  The meshes have between 95 and 110 % of it")
+        more="The meshes have between 95 and 110 % of this number.  With SCALABLE it is the number "
+        "of samples")
     wrap: bool = network(False, "wrap the shapes in a watertight surface before remeshing",
         of="low resolution")
     refined_eigenfunctions: bool = network(False,
-        "approximate eigenfunctions of the original meshes instead of U Phi", paper=False,
+        "use refined full-resolution eigenfunctions instead of U Phi", paper=False,
         section="eq. 4, 7, 8", instead="$U \\phi$", see="method/refined_eigenfunctions",
         of="low resolution", pair=True,
-        more="Computed by one step of inverse iteration and used in eq. 4, 7 and the smoothing of "
-        "eq. 8.  They are stored in ``/coarse``: 40 MB for 100,000 vertices")
+        more="U Phi interpolates the eigenfunctions of the coarse mesh.  The refined ones "
+        "approximate those of the original mesh by one step of inverse iteration.  They are used "
+        "in eq. 4, in eq. 7 and in the smoothing of eq. 8.  ``/coarse`` stores them, 40 MB for "
+        "100,000 vertices")
     k_init: int = network(20, "size of the initial functional maps", least=4, section="5.1",
         pair=True)
     k: int = network(100, "size of the refined functional maps", least=4, section="5.1",
         of="low resolution", pair=True)
     n_pairs: int = network(500, "number of pairs in the network, each with maps in both directions",
-        least=1, section="5.1", more="All pairs if there are fewer")
+        least=1, section="5.1", more="All pairs are used if there are fewer")
     init: str = network("dense",
         "initial maps from all nearest neighbours, or from 10 landmarks as in the paper",
         choices=("dense", "landmarks"), paper="landmarks", section="4.1, steps 3 and 4",
         instead="initial map fitted to 10 landmarks", see="method/initial_map", of="initial maps",
         pair=True,
-        more="Nearest neighbours are those after ICP.  Where poses differ a lot, the best of "
-        "several initial maps is taken, see :func:`s4a.match_pair`")
+        more="Nearest neighbours are found after ICP.  If poses differ a lot, the best of several "
+        "initial maps is used")
     initial_refinement: str = network("always",
-        "refine initial maps by one ZoomOut iteration: those of the network and of single pairs "
-        "(always), of the network only, or never",
+        "refine initial maps by one ZoomOut iteration: in the network and for single pairs "
+        "(always), in the network only (network), or never",
         choices=("always", "network", "never"), paper="network", section="4.2",
         instead="one ZoomOut iteration before Consistent ZoomOut", see="method/initial_map",
         of="initial maps", given_as="never".__ne__, pair=True,
-        more="The iteration keeps the size of the map.  Single pairs are matched as in 4.1")
+        more="The iteration does not change the size of the map.  Single pairs are matched by "
+        ":func:`s4a.match_pair` (4.1)")
     step: int = network(5, "eigenfunctions added in each iteration of Consistent ZoomOut", least=1,
         section="4.2", pair=True)
     n_latent: int | None = network(None, "dimension of the latent space; by default k", least=2,
         section="eq. 3")
-    weights: str = network("cycles", "weights of the maps: from their cycle errors, or all 1",
+    weights: str = network("cycles",
+        "weights of the maps: from their cycle errors (cycles), or all 1 (equal)",
         choices=("cycles", "equal"), section="eq. 3", see="method/network")
     n_samples: int = network(N_SAMPLES,
-        "farthest-point samples for which Consistent ZoomOut searches matches; 0: all vertices",
+        "number of farthest-point samples that Consistent ZoomOut matches; 0 for all vertices",
         paper=0, fast=500, section="eq. 3", instead="for all vertices in every iteration",
         see="method/latent", of="initial maps",
-        more="Also used by the initial refinement where pose differences are small.  At least 2 k")
+        more="The number must be at least 2 k.  The initial refinement also uses the samples if "
+        "pose differences are small")
     dense_iterations: int = network(4,
-        "number of final iterations that also search between the samples",
-        paper=0, fast=0, section="eq. 3", see="method/latent")
-    norm: str = network("h2", "norm that decides which shape is the median",
+        "number of final Consistent ZoomOut iterations that also search between the samples",
+        paper=0, fast=0, section="eq. 3", see="method/latent",
+        more="Matches between samples alone are only as accurate as the spacing of the samples.  "
+        "These iterations also search the vertices around each match.  With ``n_samples=0`` all "
+        "vertices are searched anyway")
+    norm: str = network("h2",
+        "norm of the shape differences; the shape with the smallest norm is the median",
         choices=("h2", "h1", "frobenius", "h2_image", "h2_both"), section="eq. 5",
-        more="See :func:`s4a.method.median.distance_to_identity`")
+        more="'frobenius' weights all eigenfunctions equally.  'h1' gives fine detail less weight, "
+        "and 'h2' even less.  'h2_image' gives fine detail more weight.  'h2_both' gives fine "
+        "detail less weight in the domain and more weight in the image.  "
+        ":func:`s4a.method.median.distance_to_identity` has the formulas")
     keep_iterations: bool = network(False,
         "store the maps and latent bases of every iteration of Consistent ZoomOut",
-        more="They are in ``/iterations``")
+        more="They are the nodes of ``/iterations``")
     template: str | None = registration(None,
         "name of the shape to register to; by default the median shape")
     dense_match: str = registration("latent",
@@ -351,39 +371,45 @@ class Options:
         choices=("latent", "fmap"), section="4.2",
         more='Unless ``refine="intrinsic"``, this match is one of several initialisations')
     refine: str = registration("elastic",
-        "elastic iterations, iterated spectral non-rigid ICP, or no refinement as in the paper",
+        "refinement of the match: elastic iterations, iterated spectral non-rigid ICP, or none as "
+        "in the paper (intrinsic)",
         choices=("elastic", "spectral_icp", "intrinsic"), paper="intrinsic", section="eq. 7, 4",
         instead="the match as it is", see="method/elastic", of="registration", pair=True,
-        more="Elastic iterations penalise bending and stretch; where poses differ a lot, spectral "
-        "non-rigid ICP comes first (:mod:`s4a.method.spectral_icp`).  Spectral non-rigid ICP alone "
-        "keeps the best of several results")
+        more="Elastic iterations penalise bending and stretch.  If poses differ a lot, spectral "
+        "non-rigid ICP comes first (:mod:`s4a.method.spectral_icp`).  With 'spectral_icp' the best "
+        "of several results is kept")
     articulated: bool = registration(True,
-        "where poses differ a lot, spectral non-rigid ICP rotates each part on its own",
-        paper=False, section="eq. 8", see="method/deform", of="registration", pair=True)
+        "if poses differ a lot, spectral non-rigid ICP fits a separate rigid transform to each "
+        "part, such as a limb",
+        paper=False, section="eq. 8", see="method/deform", of="registration", pair=True,
+        more="Otherwise one rigid transform applies to the whole shape")
     full_resolution_iterations: int = registration(1,
-        "ZoomOut iterations of a single pair that search all vertices of the source",
+        "number of ZoomOut iterations of a single pair that search all vertices of the source",
         paper=0, section="eq. 4", instead="after ZoomOut on coarse vertices", see="method/register",
-        pair=True, more="External meshes of a transfer are single pairs, too")
+        pair=True, more="They follow ZoomOut on coarse vertices.  An external mesh of a transfer "
+        "and the template are a single pair, too")
     bidirectional: bool = registration(True,
         "match single pairs in both directions and average the transfer over both",
         paper=False, section="6.2", instead="a template registered to a shape",
-        see="analysis/transfer", pair=True, more="See :func:`s4a.register_pairs`")
+        see="analysis/transfer", pair=True, more="It is an option of :func:`s4a.register_pairs`")
     alignment: str = registration("fitted",
-        "rigid alignment before displacements are computed: fitted to the registered surface, or "
-        "by ICP",
+        "rigid alignment to the template before displacements are computed: best fit of the "
+        "registered surface (fitted), or ICP before the registration (icp)",
         choices=("fitted", "icp"), paper="icp", section="eq. 8",
-        instead="after ICP (4.1, step 2)", see="method/deform", of="registration", pair=True)
+        instead="after ICP (4.1, step 2)", see="method/deform", of="registration", pair=True,
+        more="With 'icp', eq. 8 holds as printed in the paper")
     area_weighted: bool = registration(True,
         "weight vertices by area when displacements are projected onto U Phi", paper=False,
         section="after eq. 8", instead="$(U \\phi)^\\dagger$ as printed", see="method/deform",
         of="projection", pair=True)
     n_projected: int = registration(N_CENTRAL,
-        "vertices, near coarse ones, used for that projection; 0 means all", paper=0,
+        "number of vertices used to project displacements onto U Phi; 0 for all", paper=0,
         section="after eq. 8", instead="on all vertices", see="method/shape", of="projection",
-        pair=True)
+        pair=True, more="Vertices near coarse vertices are used")
     remove_size: bool = registration(False, "align with scaling, so that "
         "displacements do not contain size", of="registration")
-    intersections: bool = quality(True, "count triangles that intersect others")
+    intersections: bool = quality(True,
+        "count self-intersecting triangles: those that intersect others of the same shape")
     quality_control: str = quality("exclude",
         "flagged shapes are excluded from the network, or the run stops",
         choices=("exclude", "stop"),

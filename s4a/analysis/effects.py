@@ -49,53 +49,69 @@ def group_test(
 ) -> xr.Dataset:
     """Test whether the mean shapes of groups differ: permutation Hotelling T^2 test of the scores.
 
-    With ``variances="equal"`` the null hypothesis is that the distribution of shape, given the
-    covariates, is the same in all groups; with ``"unequal"``, that the means are equal and the
-    errors symmetric about zero.  The covariance is shrunk (Ledoit and Wolf 2004).  For more than
-    two groups the statistic is the Lawley-Hotelling trace.
+    With ``variances="equal"``, the null hypothesis is that the distribution of shape, given the
+    covariates, is the same in all groups.  With ``"unequal"``, it is that the means are equal and
+    the errors are symmetric about zero.  The covariance is shrunk (Ledoit and Wolf 2004).  For more
+    than two groups the statistic is the Lawley-Hotelling trace.
 
     Parameters
     ----------
     study : DataTree
-    group : array_like (shape,), dict of shape to value, or name in /subjects
-    covariates : as `group`, a dict of name to these, or an array_like (shape, covariate)
-        Or a list of names in /subjects: confounders to adjust for (Freedman and Lane 1983).  Text
-        is dummy-coded.  Shapes without a value are excluded, with a warning.
+        A finished study, from :func:`s4a.analyse` or :func:`s4a.open_study`.
+    group : array_like (shape,), dict of shape to value, or str
+        Group of each shape, as numbers or text; or the name of a column of ``/subjects``.  Shapes
+        without a value are excluded, with a warning.
+    covariates : array_like (shape,) or (shape, covariate), dict, str or list of str, optional
+        Confounders to adjust for (Freedman and Lane 1983): values in any form of `group`, a dict of
+        name to such values, or names of columns of ``/subjects``.  Text is dummy-coded.  None by
+        default.
     n_components : int, optional
-        By default as many components as explain 90 % of the variance, at most half of the number of
-        shapes.
+        Number of principal components whose scores are tested.  By default the first components
+        that explain 90 % of the variance, at most half of the number of shapes.
     n_permutations : int
-        If there are fewer distinct permutations, each is used once.  With covariates the test is
-        approximate.
+        Number of permutations.  If there are fewer distinct permutations, each is used once.  With
+        covariates the test is approximate.
     variances : {"equal", "unequal"}
-        Permute shapes, which assumes homogeneous covariance; or flip signs of the residuals, which
-        allows groups of different covariance and assumes symmetric errors.
-    seed, rng : see :mod:`s4a.seeds`
+        "equal" permutes shapes and assumes homogeneous covariance.  "unequal" flips signs of the
+        residuals; it allows groups of different covariance and assumes symmetric errors.
+    seed : int
+        Seed of the random numbers.
+    rng : int or numpy.random.Generator, optional
+        Replaces `seed`, as in SPEC 7.
 
     Returns
     -------
     Dataset
-        ``statistic``, ``p_value``; attributes ``groups`` (sizes), ``components``, ``permutations``,
-        ``smallest_p``, the smallest attainable p, ``covariates`` in words, and the excluded shapes
-        ``left_out``.
+        The variables are
+
+        - ``statistic``: test statistic;
+        - ``p_value``: permutation p value.
+
+        The attributes are
+
+        - ``groups``: names and sizes of the groups;
+        - ``components`` and ``permutations``: their numbers;
+        - ``smallest_p``: smallest attainable p value;
+        - ``covariates``: description of the covariates;
+        - ``left_out``: names of the excluded shapes.
 
     Raises
     ------
     ValueError
-        If a group has fewer than 3 shapes, or a covariate cannot be used: dates, names of shapes,
-        numbers mixed with text.
+        If a group has fewer than 3 shapes, or a covariate cannot be used.  Dates, names of shapes
+        and numbers mixed with text cannot be used.
 
     See Also
     --------
-    group_map : Where on the surface groups differ.
-    regression : Continuous variables.
+    group_map : Test where on the surface groups differ.
+    regression : Test the effect of a continuous variable.
 
     References
     ----------
-    Freedman, D. and Lane, D. (1983). A nonstochastic interpretation of reported significance
-    levels. Journal of Business and Economic Statistics 1(4).
-    Ledoit, O. and Wolf, M. (2004). A well-conditioned estimator for large-dimensional covariance
-    matrices. Journal of Multivariate Analysis 88(2).
+    D. Freedman and D. Lane (1983), A nonstochastic interpretation of reported significance levels,
+    Journal of Business and Economic Statistics 1(4).
+    O. Ledoit and M. Wolf (2004), A well-conditioned estimator for large-dimensional covariance
+    matrices, Journal of Multivariate Analysis 88(2).
 
     Examples
     --------
@@ -137,18 +153,28 @@ def group_map(
     Parameters
     ----------
     study, group, covariates, n_permutations, variances, seed, rng
-        See :func:`group_test`.
+        As in :func:`group_test`: a finished study, the group of each shape, confounders, and
+        options of the permutation test.
     of : {"vector", "normal"}
-        The displacements, or their normal component.
+        Test the displacements, or their components along the vertex normals.
 
     Returns
     -------
     Dataset
-        ``explained_share(vertex)``, ``p_vertex``, ``p_family_wise`` (max-T), ``p_false_discovery``
-        (Benjamini and Hochberg), ``effect(vertex, xyz)`` = mean of the second group minus mean of
-        the first, in sorted order, and ``effect_size``: Mahalanobis distance between the means of
-        two groups, Cohen's f of several.  For two groups the attribute ``difference`` names the
-        direction, such as "patient minus control".
+        The variables are
+
+        - ``explained_share(vertex)``: share of the variance that the groups explain;
+        - ``p_vertex(vertex)``: p value of each vertex, not corrected;
+        - ``p_family_wise(vertex)``: corrected for the family-wise error (max-T);
+        - ``p_false_discovery(vertex)``: corrected for the false discovery rate (Benjamini and
+          Hochberg);
+        - ``effect(vertex, xyz)``: mean of the second group minus mean of the first, in sorted
+          order, in the unit of the input;
+        - ``effect_size(vertex)``: Mahalanobis distance between the means of two groups, or Cohen's
+          f of more groups.
+
+        For two groups the attribute ``difference`` names the direction of the effect, such as
+        "patient minus control".
 
     Raises
     ------
@@ -157,13 +183,13 @@ def group_map(
 
     See Also
     --------
-    group_test : One test for the whole shape.
+    group_test : Test the whole shape once.
 
     References
     ----------
-    Westfall, P. H. and Young, S. S. (1993). Resampling-based multiple testing. Wiley.
-    Benjamini, Y. and Hochberg, Y. (1995). Controlling the false discovery rate. Journal of the
-    Royal Statistical Society B 57(1).
+    P. H. Westfall and S. S. Young (1993), Resampling-based multiple testing, Wiley.
+    Y. Benjamini and Y. Hochberg (1995), Controlling the false discovery rate, Journal of the Royal
+    Statistical Society B 57(1).
 
     Examples
     --------
@@ -223,20 +249,32 @@ def regression(
     Parameters
     ----------
     study : DataTree
-    variable : array_like (shape,), dict of shape to value, or name in /subjects
+        A finished study, from :func:`s4a.analyse` or :func:`s4a.open_study`.
+    variable : array_like (shape,), dict of shape to value, or str
+        Number of each shape, in any unit; or the name of a column of ``/subjects``.
     covariates, n_components, n_permutations, variances, seed, rng
-        See :func:`group_test`.
-    of : see :func:`group_map`
+        As in :func:`group_test`: confounders, the number of principal components of the test of the
+        whole shape, and options of the permutation tests.
+    of : {"vector", "normal"}
+        Test the displacements at every vertex, or their components along the vertex normals.
 
     Returns
     -------
     Dataset
-        The global test, ``statistic`` and ``p_value``, see :func:`group_test`; the test at every
-        vertex, see :func:`group_map`; ``effect(vertex, xyz)`` per unit of the variable,
-        ``effect_size`` = Cohen's f, and ``intercept(vertex, xyz)``; ``standard_score(shape)`` of
-        the variable.  Attributes ``mean``, ``standard_deviation``, ``lowest`` and ``highest`` of
-        the variable, ``freed_deviation``, its standard deviation adjusted for the covariates, and
-        those of :func:`group_test`.
+        The variables are
+
+        - ``statistic`` and ``p_value``: test of the whole shape, see :func:`group_test`;
+        - ``explained_share``, ``p_vertex``, ``p_family_wise`` and ``p_false_discovery``: test at
+          every vertex, see :func:`group_map`;
+        - ``effect(vertex, xyz)``: displacement per unit of the variable, in the unit of the input;
+        - ``effect_size(vertex)``: Cohen's f;
+        - ``intercept(vertex, xyz)``: displacement at the mean of the variable;
+        - ``standard_score(shape)``: standardised variable.
+
+        The attributes are those of :func:`group_test`, and
+
+        - ``mean``, ``standard_deviation``, ``lowest`` and ``highest`` of the variable;
+        - ``freed_deviation``: standard deviation of the variable, adjusted for the covariates.
 
     Raises
     ------
@@ -245,8 +283,8 @@ def regression(
 
     See Also
     --------
-    predict : Shape at a value of the variable.
-    regression_modes : The regression as a mode of variation.
+    predict : Predict the shape at a value of the variable.
+    regression_modes : Convert the regression to a mode of variation.
 
     Examples
     --------
@@ -334,16 +372,17 @@ def predict(study: xr.DataTree, fit: xr.Dataset, value: float) -> xr.Dataset:
     fit : Dataset
         Result of :func:`regression`.
     value : float
-        Value of the variable, in its unit.
+        Value of the variable, in the unit of the variable.
 
     Returns
     -------
     Dataset
-        ``position(vertex, xyz)`` and ``corner_vertex``.
+        A mesh with ``position(vertex, xyz)`` in the unit of the input and ``corner_vertex(triangle,
+        corner)``.
 
     See Also
     --------
-    regression_modes : An animation of these shapes.
+    regression_modes : Convert the regression to a study, to animate these shapes.
 
     Examples
     --------
@@ -372,12 +411,14 @@ def predict(study: xr.DataTree, fit: xr.Dataset, value: float) -> xr.Dataset:
 def regression_modes(study: xr.DataTree, fit: xr.Dataset, name: str = "variable") -> xr.DataTree:
     """Convert a :func:`regression` to a study with one mode of variation, to show it.
 
-    ``s4a.explore`` shows it with a slider, :func:`s4a.write_page` and :func:`s4a.write_film` write
-    it to a file.  One standard deviation of the mode is one standard deviation of the variable.
+    :func:`s4a.explore` shows the mode with a slider.  :func:`s4a.write_page` and
+    :func:`s4a.write_film` write it to a file.  One standard deviation of the mode is one standard
+    deviation of the variable.
 
     Parameters
     ----------
     study : DataTree
+        The study of the regression.
     fit : Dataset
         Result of :func:`regression`.
     name : str
@@ -386,14 +427,17 @@ def regression_modes(study: xr.DataTree, fit: xr.Dataset, name: str = "variable"
     Returns
     -------
     DataTree
-        ``/registration`` and ``/coarse`` of the study, and ``/pca`` with one component:
-        ``deformation`` is the effect of one standard deviation, ``score`` the standardised variable
-        of each shape, ``explained_variance_ratio`` the explained share of the variance of the
-        displacements.
+        ``/registration`` and ``/coarse`` of the study, and ``/pca`` with one component.  The
+        variables of ``/pca`` are
+
+        - ``deformation``: effect of one standard deviation, in the unit of the input;
+        - ``score``: standardised variable of each shape;
+        - ``explained_variance_ratio``: share of the variance of the displacements that the variable
+          explains.
 
     See Also
     --------
-    predict : The shape at one value.
+    predict : Predict the shape at one value.
 
     Examples
     --------

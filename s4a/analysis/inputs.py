@@ -125,17 +125,17 @@ def registration_of(study: xr.DataTree) -> xr.Dataset:
 def with_flagged(study: xr.DataTree) -> xr.DataTree:
     """Return a study that includes its flagged shapes in modes and statistics.
 
-    The same as ``include_flagged=True`` of :func:`s4a.analyse`, without another run.
+    The result is that of ``include_flagged=True`` of :func:`s4a.analyse`, without another run.
 
     Parameters
     ----------
     study : DataTree
-        With ``/registration`` and ``/report``.
+        A study with ``/registration`` and ``/report``.
 
     Returns
     -------
     DataTree
-        With the modes of all registered shapes in ``/pca``.
+        The study, with the modes of all registered shapes in ``/pca``.
 
     Raises
     ------

@@ -340,30 +340,41 @@ def evaluate(
     Parameters
     ----------
     study : DataTree
+        A finished study, from :func:`s4a.analyse` or :func:`s4a.open_study`.
     n_samples : int
         Number of random shapes for specificity.
     n_permutations : int
-        Permutations of the baseline (parallel analysis, Horn 1965): every coefficient of the
-        displacements in the template's eigenfunctions is permuted over the shapes, so that fields
-        stay smooth.
+        Number of permutations of the baseline (parallel analysis, Horn 1965).  Every coefficient of
+        the displacements in the template's eigenfunctions is permuted over the shapes, so that
+        fields stay smooth.
     n_points : int
-        Vertices from which distances to surfaces are measured; 0 omits these measures.
+        Number of vertices from which distances to surfaces are measured; 0 omits these measures.
     n_surface : int
         Number of random shapes whose distances to surfaces are measured.
-    seed, rng : see :mod:`s4a.seeds`
+    seed : int
+        Seed of the random numbers.
+    rng : int or numpy.random.Generator, optional
+        Replaces `seed`, as in SPEC 7.
 
     Returns
     -------
     Dataset
-        ``compactness(component)``, cumulative variance of the first components, with the standard
-        error sqrt(2 / s) times it for s shapes (Davies 2002).  ``generalization(component)``,
-        leave-one-out reconstruction error, NaN for the last component; the correspondences are not
-        recomputed, so it is optimistic.  ``specificity(component)``, distance of random shapes to
-        the nearest shape.  The last two are area-weighted root mean square vertex distances, those
-        ending in ``_surface`` mean point-to-surface distances, in the unit of the input, each with
-        its standard error.  ``variance_ratio``, ``variance_ratio_null``,
-        ``variance_ratio_null_95``.  The attribute ``generalization_0`` is that of the mean shape
-        alone.
+        All variables are measured with 1, 2, ... components:
+
+        - ``compactness(component)``: cumulative variance of the first components.  Its standard
+          error for s shapes is sqrt(2 / s) times the compactness (Davies 2002);
+        - ``generalization(component)``: leave-one-out reconstruction error, NaN for the last
+          component.  It is optimistic, as the correspondences are not recomputed;
+        - ``specificity(component)``: distance of random shapes to the nearest shape of the study;
+        - ``generalization_surface`` and ``specificity_surface``: the same as mean point-to-surface
+          distances;
+        - ``variance_ratio(component)``: share of the variance of each component;
+        - ``variance_ratio_null`` and ``variance_ratio_null_95``: mean and 95 % quantile of that
+          share in the baseline.
+
+        Generalization and specificity are area-weighted root mean square vertex distances, in the
+        unit of the input.  Each has a standard error.  The attribute ``generalization_0`` is the
+        error of the mean shape alone.
 
     Raises
     ------
@@ -372,15 +383,15 @@ def evaluate(
 
     See Also
     --------
-    outliers : Leave-one-out error of each shape.
-    sample : Random shapes of the model.
+    outliers : Detect outliers by the leave-one-out error of each shape.
+    sample : Draw random shapes of the model.
 
     References
     ----------
-    Davies, R. H. (2002). Learning shape: optimal models for analysing natural variability. PhD
+    R. H. Davies (2002), Learning shape: optimal models for analysing natural variability, PhD
     thesis, University of Manchester.
-    Styner, M. et al. (2003). Evaluation of 3D correspondence methods for model building. IPMI.
-    Horn, J. L. (1965). A rationale and test for the number of factors in factor analysis.
+    M. Styner et al. (2003), Evaluation of 3D correspondence methods for model building, IPMI.
+    J. L. Horn (1965), A rationale and test for the number of factors in factor analysis,
     Psychometrika 30(2).
 
     Examples
@@ -388,9 +399,8 @@ def evaluate(
     In a study of six small brains, more modes reconstruct a left-out shape better:
 
     >>> import s4a
-    >>> from s4a.analysis.model import evaluate
     >>> study = s4a.synthetic.example_study()
-    >>> quality = evaluate(study)
+    >>> quality = s4a.statistics.evaluate(study)
     >>> bool(quality["generalization"][0] > quality["generalization"][3])
     True
     """
@@ -490,34 +500,38 @@ def sample(
     Parameters
     ----------
     study : DataTree
+        A finished study, from :func:`s4a.analyse` or :func:`s4a.open_study`.
     n : int
         Number of shapes.
     n_components : int, optional
-        All by default.
-    seed, rng : see :mod:`s4a.seeds`
+        Number of components with random scores; by default all.
+    seed : int
+        Seed of the random numbers.
+    rng : int or numpy.random.Generator, optional
+        Replaces `seed`, as in SPEC 7.
 
     Returns
     -------
     DataTree
-        ``/sample_1`` ... with a mesh each, and at the root ``score(shape, component)``.
+        The nodes ``/sample_1``, ``/sample_2`` and so on, each with a mesh.  The root has
+        ``score(shape, component)``, in standard deviations.
 
     Raises
     ------
     ValueError
-        If there are not as many components.
+        If the study has fewer than `n_components` components.
 
     See Also
     --------
-    s4a.synthesize : The shape of given scores.
+    s4a.synthesize : Synthesise the shape of given scores.
 
     Examples
     --------
     In a study of six small brains:
 
     >>> import s4a
-    >>> from s4a.analysis.model import sample
     >>> study = s4a.synthetic.example_study()
-    >>> sample(study, 2)["score"].dims
+    >>> s4a.statistics.sample(study, 2)["score"].dims
     ('shape', 'component')
     """
     check_type(study, xr.DataTree)

@@ -70,20 +70,25 @@ def outliers(
     Parameters
     ----------
     study : DataTree
+        A finished study, from :func:`s4a.analyse` or :func:`s4a.open_study`.
     n_components : int, optional
-        By default the components of 90 % of the variance, at most a tenth of the shapes, as the
-        largest variances of a sample overestimate those of the population.
+        Number of principal components of the Mahalanobis distance.  By default the first components
+        that explain 90 % of the variance, at most a tenth of the number of shapes.  With more
+        components, the variances of a sample overestimate those of the population.
     level : float
         Significance level of the Mahalanobis distance.
 
     Returns
     -------
     Dataset
-        For each shape left out of the model: ``mahalanobis(shape)`` of its scores and ``outlier_p``
-        (F distribution of a new observation; exact for a population with as many components,
-        conservative for more), ``left_out_error(shape)`` in the unit of the input, and
-        ``outlier(shape)``: p below `level`, or an error more than 3.5 robust standard deviations
-        above the median (Iglewicz and Hoaglin 1993).
+        Each shape is compared with the model of all other shapes.  The variables are
+
+        - ``mahalanobis(shape)``: Mahalanobis distance of the scores;
+        - ``outlier_p(shape)``: its p value, by the F distribution of a new observation.  It is
+          exact for a population with `n_components` components, and conservative for more;
+        - ``left_out_error(shape)``: reconstruction error, in the unit of the input;
+        - ``outlier(shape)``: True if the p value is below `level`, or if the error is more than 3.5
+          robust standard deviations above the median.
 
     Raises
     ------
@@ -92,7 +97,11 @@ def outliers(
 
     See Also
     --------
-    evaluate : Measures of the whole model.
+    evaluate : Measure the quality of the whole model.
+
+    References
+    ----------
+    B. Iglewicz and D. C. Hoaglin (1993), How to detect and handle outliers, ASQC Quality Press.
 
     Examples
     --------
@@ -144,28 +153,44 @@ def classify(
 ) -> xr.Dataset:
     """Classify shapes into groups, with cross-validation and a permutation test.
 
-    PCA, scaling and estimator are fitted to the training shapes of each fold.  PCA of their scores
-    on all components equals PCA of their displacements, as the scores are isometric.
+    PCA, scaling and estimator are fitted to the training shapes of each fold.  PCA uses the scores
+    on all components.  Its result equals PCA of the displacements, as the scores are isometric.
 
     Parameters
     ----------
     study : DataTree
-    group : see :func:`group_test`
+        A finished study, from :func:`s4a.analyse` or :func:`s4a.open_study`.
+    group : array_like (shape,), dict of shape to value, or str
+        Group of each shape, as numbers or text; or the name of a column of ``/subjects``.
     estimator : scikit-learn classifier, optional
-        Logistic regression by default; it is cloned.
+        Logistic regression by default.  The estimator is cloned.
     n_components : int, optional
-        As in :func:`group_test`, at most two fewer than training shapes.
+        Number of principal components, at most the number of training shapes minus 2.  The default
+        is that of :func:`group_test`.
     n_folds : int
-        Stratified folds; at most the size of the smallest group.
+        Number of stratified folds, at most the size of the smallest group.
     n_permutations : int
-        Permutations of the groups for the p value.
-    seed, rng : see :mod:`s4a.seeds`
+        Number of permutations of the groups for the p value.
+    seed : int
+        Seed of the random numbers.
+    rng : int or numpy.random.Generator, optional
+        Replaces `seed`, as in SPEC 7.
 
     Returns
     -------
     Dataset
-        ``predicted(shape)``, ``accuracy(fold)`` (balanced), ``p_value``; attributes
-        ``balanced_accuracy`` of all predictions, ``chance``, ``smallest_p``, ``correspondence``.
+        The variables are
+
+        - ``predicted(shape)``: predicted group of each shape in the test fold;
+        - ``accuracy(fold)``: balanced accuracy, from 0 to 1;
+        - ``p_value``: permutation p value.
+
+        The attributes are
+
+        - ``balanced_accuracy``: balanced accuracy of all predictions;
+        - ``chance``: expected accuracy of a random prediction;
+        - ``smallest_p``: smallest attainable p value;
+        - ``correspondence``: a note that the correspondences depend on all shapes.
 
     Raises
     ------

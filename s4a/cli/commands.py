@@ -140,7 +140,7 @@ def demo(
     shapes : N
         number of shapes
     vertices : N
-        vertices of each
+        number of vertices of each shape
     dirty
         add loose parts, holes and non-manifold edges
     open
@@ -210,7 +210,7 @@ def view(
     page : FILE
         file to write (default: STUDY/study.html)
     title : TITLE
-        of the page (default: name of the folder)
+        title of the page (default: name of the folder)
     view : VIEW
         viewpoint: corner, front, back, left, right, top or bottom (default: corner)
     up
@@ -242,21 +242,21 @@ def statistics(
     study : STUDY
         its folder
     group : COLUMN
-        test and map of the difference between groups; classification
+        column of groups: test and map their difference, and classify the shapes
     regress_on : COLUMN
-        regression of shape on a number, such as age; its animation
+        column of numbers, such as age: regress shape on it, and write an animation
     covariates : COLUMN
-        covariates of both, separated by spaces or commas
+        covariates of these tests, separated by spaces or commas
     table : PATH
         CSV with a column 'shape', in place of the table of the study
     variances
-        of the residuals; unequal if groups have different covariance
+        variances of the residuals; unequal if groups have different covariance
     include_flagged
         include flagged shapes
     permutations : N
-        of every test (default: 9999, at every vertex 999, of classes 99)
+        number of permutations of every test (default: 9999, at every vertex 999, of classes 99)
     out : FOLDER
-        for netCDF and CSV (default: STUDY/statistics)
+        folder for netCDF and CSV files (default: STUDY/statistics)
     """
     if covariates and not (group or regress_on):
         raise ValueError("--covariates needs a test: give --group or --regress-on")
@@ -360,11 +360,11 @@ def insert(
     shapes : SHAPE
         mesh files, label volumes, folders or globs
     out : FOLDER
-        for inserted.nc, registered meshes and scores
+        folder for inserted.nc, registered meshes and scores
     landmarks : PATH
         folder of landmark files named as the shapes, which guide registration
     reflect : NAMES
-        new shapes to mirror: names, with commas; or auto, those of the rarer side
+        new shapes to mirror: names separated by commas; or auto, those mirrored to the study
     """
     tree = s4a.open_study(study)
     inserted = s4a.insert(tree, shapes, landmarks=landmarks, reflect=reflect, n_jobs=n_jobs)
@@ -401,7 +401,7 @@ def transfer(
     source_landmarks : FILE
         landmarks and curves of the source: Slicer .mrk.json, CSV or MeshLab .pp
     out : FOLDER
-        for <target>.labels.npy, .confidence.npy, .landmarks.csv
+        folder for <target>.labels.npy, .confidence.npy, .landmarks.csv
     blur : X
         radius within which votes for labels count, in multiples of the uncertainty of the match
         (default: 1; 0 with --preset paper)
@@ -523,7 +523,8 @@ def compare(
     collection : PATH
         folders, globs or mesh files of the collection of Table 2
     methods : METHOD
-        of kNN, ZO, FMAP+ZO, SCALABLE, RE-MATCH, RE-MATCH refined, registered, registered surface
+        some of kNN, ZO, FMAP+ZO, SCALABLE, RE-MATCH, RE-MATCH refined, registered, registered
+        surface
     truth : FILE
         ground truth for each target, NPY or text: for every vertex of its file the vertex of the
         source (from 0; -1: none), or x, y, z
@@ -533,7 +534,7 @@ def compare(
     keep
         also write meshes, matches and maps to compare.nc, for the panel that shows them
     out : FOLDER
-        for compare.nc and compare.png
+        folder for compare.nc and compare.png
     """
     options["n_coarse"] = options["n_coarse"] or N_COARSE
     if collection:

@@ -325,7 +325,10 @@ def simulate(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = 
     ----------
     n : int
         Number of shapes.
-    seed, rng : see :mod:`s4a.seeds`
+    seed : int
+        Seed of the random numbers.
+    rng : int or numpy.random.Generator, optional
+        Replaces `seed`, as in SPEC 7.
     n_modes : int
         Number of simulated modes.
 
@@ -515,7 +518,10 @@ def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
     truth, shape : as for :func:`position`
     n_vertices : int
         Without the artefacts.
-    seed, rng : see :mod:`s4a.seeds`
+    seed : int
+        Seed of the random numbers.
+    rng : int or numpy.random.Generator, optional
+        Replaces `seed`, as in SPEC 7.
 
     Returns
     -------
@@ -568,7 +574,10 @@ def brains(
         Number of shapes.
     n_vertices : int
         Vertices of each shape, exact unless `dirty`.  The population does not depend on it.
-    seed, rng : see :mod:`s4a.seeds`
+    seed : int
+        Seed of the random numbers.
+    rng : int or numpy.random.Generator, optional
+        Replaces `seed`, as in SPEC 7.
     dirty : bool
         Whether to add artefacts of scanner files and clean the meshes; ``/raw/<shape>`` then has
         the meshes before cleaning.
@@ -578,10 +587,13 @@ def brains(
     Returns
     -------
     DataTree
-        ``/original/<shape>`` and ``/report`` as from :func:`s4a.read_shapes`, with labels and
-        landmarks; ``/truth``, see :func:`simulate`; and in ``/truth/<shape>`` the
-        ``reference_point(vertex, xyz)`` of every vertex.  It is approximate for the few vertices
-        that cleaning inserts on an edge, and exact for all others.
+        The nodes are
+
+        - ``/original/<shape>`` and ``/report``: as from :func:`s4a.read_shapes`, with labels and
+          landmarks;
+        - ``/truth``: simulated parameters, see :func:`simulate`;
+        - ``/truth/<shape>``: ``reference_point(vertex, xyz)`` of every vertex.  It is approximate
+          for the few vertices that cleaning inserts on an edge, and exact for all others.
 
     Notes
     -----

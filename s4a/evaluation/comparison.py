@@ -203,7 +203,10 @@ def compare(
     keep : bool
         Whether to return meshes, matches and maps, too, for :class:`s4a.widgets.Comparison`: about
         30 bytes per vertex and method.
-    seed, rng : see :mod:`s4a.seeds`
+    seed : int
+        Seed of the random numbers.
+    rng : int or numpy.random.Generator, optional
+        Replaces `seed`, as in SPEC 7.
 
     Returns
     -------

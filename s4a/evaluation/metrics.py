@@ -472,12 +472,18 @@ def evaluate(
     Returns
     -------
     Dataset
-        Always ``chamfer``, ``hausdorff``, ``hausdorff_paper``, ``dirichlet``, ``coverage``,
-        ``collapsed_share``, ``conformal_distortion`` and ``area_distortion`` (medians by area over
-        the triangles that do not collapse). With `reverse` also ``bijectivity``; with `truth`
-        ``geodesic_error`` (of the matched vertices), ``euclidean_error`` (of the image) and
-        ``error_curve(threshold)``; with labels ``label_accuracy`` (by area) and ``label_dice``
-        (mean over the labels of the target); with landmarks ``landmark_error`` (mean).
+        The variables are
+
+        - ``chamfer``, ``hausdorff``, ``hausdorff_paper``, ``dirichlet``, ``coverage`` and
+          ``collapsed_share``;
+        - ``conformal_distortion`` and ``area_distortion``: medians by area over the triangles that
+          do not collapse;
+        - with `reverse`: ``bijectivity``;
+        - with `truth`: ``geodesic_error`` of the matched vertices, ``euclidean_error`` of the image
+          and ``error_curve(threshold)``;
+        - with labels: ``label_accuracy`` by area, and ``label_dice``, the mean over the labels of
+          the target;
+        - with landmarks: ``landmark_error``, the mean over the landmarks.
 
         Results stack with ``xarray.concat`` along a new dim, such as ``algorithm`` (``method`` is
         a keyword of ``sel``).

@@ -140,10 +140,15 @@ def read_shapes(
     Returns
     -------
     DataTree
-        ``/original/<shape>`` for every usable shape, and ``/report`` over all shapes with
-        ``status`` (ok, repaired, flagged or excluded), ``reason`` (repairs, or why the shape is
-        excluded), ``warning`` (suspect properties, left as they are), ``path`` and counts; the
-        attribute ``remarks`` has findings about several shapes, one per line.
+        ``/original/<shape>`` is the clean mesh of every usable shape.  ``/report`` has for every
+        shape
+
+        - ``status``: ok, repaired, flagged or excluded;
+        - ``reason``: repairs, or the reason why the shape is excluded;
+        - ``warning``: suspect properties, which are not changed;
+        - ``path`` of the file, and counts.
+
+        The attribute ``remarks`` has findings about several shapes, one per line.
 
     Raises
     ------

@@ -313,8 +313,8 @@ def zoomout(
 
     References
     ----------
-    Melzi, S. et al. (2019). ZoomOut: spectral upsampling for efficient shape correspondence. ACM
-    TOG 38(6).
+    S. Melzi et al. (2019), ZoomOut: spectral upsampling for efficient shape correspondence, ACM
+    Transactions on Graphics 38(6).
     """
     sizes = [*range(C.shape[0] + step, k, step), k] if k > C.shape[0] else []
     for size in sizes:
@@ -374,8 +374,8 @@ def fit(
 
     References
     ----------
-    Ovsjanikov, M. et al. (2012). Functional maps: a flexible representation of maps between shapes.
-    ACM TOG 31(4).
+    M. Ovsjanikov et al. (2012), Functional maps: a flexible representation of maps between shapes,
+    ACM Transactions on Graphics 31(4).
 
     Examples
     --------

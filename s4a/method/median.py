@@ -27,10 +27,10 @@ def area_differences(Y: Array) -> Array:
 
     References
     ----------
-    Rustamov, R. et al. (2013). Map-based exploration of intrinsic shape differences and
-    variability. ACM TOG 32(4).
-    Huang, R. et al. (2019). Limit shapes: a tool for understanding shape differences and
-    variability in 3D model collections. Computer Graphics Forum 38(5).
+    R. Rustamov et al. (2013), Map-based exploration of intrinsic shape differences and variability,
+    ACM Transactions on Graphics 32(4).
+    R. Huang et al. (2019), Limit shapes: a tool for understanding shape differences and variability
+    in 3D model collections, Computer Graphics Forum 38(5).
     """
     return np.einsum("nkl,nkm->nlm", Y, Y)
 

@@ -275,8 +275,8 @@ def synthesize(study: xr.DataTree, scores: Array) -> xr.Dataset:
 
     References
     ----------
-    Cootes, T. F. et al. (1995). Active shape models: their training and application. Computer
-    Vision and Image Understanding 61(1).
+    T. F. Cootes et al. (1995), Active shape models: their training and application, Computer Vision
+    and Image Understanding 61(1).
 
     Examples
     --------

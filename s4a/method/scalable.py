@@ -165,8 +165,8 @@ def reduce(mesh: xr.Dataset, *, n_samples: int = 6000, k: int = 100, seed: int =
 
     References
     ----------
-    Magnet, R. and Ovsjanikov, M. (2023). Scalable and efficient functional map computations on
-    dense meshes. Computer Graphics Forum 42(2).
+    R. Magnet and M. Ovsjanikov (2023), Scalable and efficient functional map computations on dense
+    meshes, Computer Graphics Forum 42(2).
 
     Examples
     --------

@@ -175,7 +175,7 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
 
     References
     ----------
-    Pinkall, U. and Polthier, K. (1993). Computing discrete minimal surfaces and their conjugates.
+    U. Pinkall and K. Polthier (1993), Computing discrete minimal surfaces and their conjugates,
     Experimental Mathematics 2(1).
 
     Examples

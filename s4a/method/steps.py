@@ -690,16 +690,17 @@ def register_shape(
         Displacements are in the frame of the template and in the unit of the input.
 
         - ``registered_match(vertex)``: matched vertex of the shape for each vertex of the template;
-        - ``displacement(vertex, xyz)``: displacement of the template, and ``displacement_raw``, the
-          same before smoothing;
+        - ``displacement(vertex, xyz)``: from the template to the registered surface;
+        - ``displacement_raw(vertex, xyz)``: from the template to the matched vertices;
         - ``registered_match_low(low_vertex)`` and ``displacement_low``: match by eq. 6 and its
           displacement at low resolution;
         - ``displacement_coefficient(eigenpair, xyz)``: projection of the displacement onto U Phi of
           the template;
         - ``icp_rotation`` and ``icp_translation``: rigid transform by ICP;
         - ``rotation``, ``translation`` and ``scale``: alignment of the shape to the template;
-        - ``confidence(vertex)``: confidence of the match, from 0 to 1, computed from ``round_trip``
-          and ``distortion``;
+        - ``confidence(vertex)``: estimated probability of an error below 1 % of sqrt(area);
+        - ``round_trip(vertex)``: error of the match in both directions, and
+          ``distortion(vertex)``, the log area ratio;
         - ``template_triangle(original_vertex)`` and ``template_barycentric``: triangle and
           barycentric coordinates on the template for each vertex of the shape.
 

@@ -39,7 +39,8 @@ class FunctionalMap(Panel):
 
     References
     ----------
-    Ovsjanikov et al., "Functional maps", ACM Trans. Graph. 31(4), 2012.
+    M. Ovsjanikov et al. (2012), Functional maps: a flexible representation of maps between shapes,
+    ACM Transactions on Graphics 31(4).
     """
 
     needs = ("network/fmap", "network/fmap_initial")

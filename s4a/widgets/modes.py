@@ -129,7 +129,8 @@ class Modes(Panel):
 
     References
     ----------
-    Cootes et al., "Active shape models: their training and application", CVIU 61(1), 1995.
+    T. F. Cootes et al. (1995), Active shape models: their training and application, Computer Vision
+    and Image Understanding 61(1).
     """
 
     needs = ("registration/position", "pca/deformation")

@@ -45,8 +45,8 @@ ERRORS = "cycle error (logarithmic)"
 class Network(Panel):
     """Shapes as nodes, maps as edges coloured by cycle error; a click shows the meshes and the map.
 
-    Of more than a hundred shapes the graph shows the selected shape, the median, and the shapes
-    with the shortest paths from them.  The numbers next to it are of all shapes.
+    For more than a hundred shapes, the graph shows the selected shape, the median, and the shapes
+    with the shortest paths from them.  The numbers next to the graph refer to all shapes.
 
     Attributes
     ----------
@@ -61,7 +61,8 @@ class Network(Panel):
 
     References
     ----------
-    Huang et al., "Limit shapes", Computer Graphics Forum 38(5), 2019.
+    R. Huang et al. (2019), Limit shapes: a tool for understanding shape differences and variability
+    in 3D model collections, Computer Graphics Forum 38(5).
     """
 
     needs = tuple(

@@ -19,8 +19,7 @@ FIRST = "number of eigenfunctions from which the surface is reconstructed"
 class Spectrum(Panel):
     """Eigenvalues with Weyl's law, an eigenfunction, the surface from its first k coefficients.
 
-    Of more than a hundred shapes only every second, third, ... curve is drawn, and the selected
-    shape.
+    For more than a hundred shapes, only some curves are drawn, and that of the selected shape.
 
     Attributes
     ----------
@@ -33,8 +32,8 @@ class Spectrum(Panel):
 
     References
     ----------
-    Reuter et al., "Laplace-Beltrami spectra as 'Shape-DNA' of surfaces and solids",
-    Computer-Aided Design 38(4), 2006.
+    M. Reuter et al. (2006), Laplace-Beltrami spectra as 'Shape-DNA' of surfaces and solids,
+    Computer-Aided Design 38(4).
     """
 
     needs = ("coarse",)
