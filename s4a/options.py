@@ -252,7 +252,7 @@ class Options:
         choices=("paper", "fast"), pair=True,
         more="The default, None, uses all additions.  Errors of 'fast' are about a tenth larger "
         "(``benchmarks/cheaper.py``).  A value that contradicts the preset is refused.  To change "
-        'one entry of a preset, pass ``s4a.options.PRESETS["paper"]`` with that entry changed')
+        "one entry, pass ``Options(**PRESETS['paper'] | {'refine': 'elastic'})``")
     seed: int = computing(0, "seed of all random numbers", of="low resolution", pair=True,
         more="``rng``, an integer or a ``numpy.random.Generator``, can replace it")
     pattern: str | None = reading(None,
@@ -299,7 +299,7 @@ class Options:
         more="The methods are ReMatching and SCALABLE.  Both give the same nodes and variables, "
         "but SCALABLE has no U.  Its coarse vertices are samples, joined by an edge where their "
         "cells meet.  "
-        "``refined_eigenfunctions`` and ``wrap`` need a coarse mesh and are refused")
+        "``refined_eigenfunctions`` and ``wrap`` cannot be used with SCALABLE")
     n_coarse: int = network(N_COARSE, "number of vertices of the low-resolution meshes", least=100,
         fast=3000, section="4.1", of="low resolution", pair=True,
         more="The meshes have between 95 and 110 % of this number.  With SCALABLE it is the number "
@@ -321,14 +321,14 @@ class Options:
     n_pairs: int = network(500, "number of pairs in the network, each with maps in both directions",
         least=1, section="5.1", more="All pairs are used if there are fewer")
     init: str = network("dense",
-        "initial maps from all nearest neighbours, or from 10 landmarks as in the paper",
+        "initial maps from the nearest neighbours of all vertices, or from 10 landmarks",
         choices=("dense", "landmarks"), paper="landmarks", section="4.1, steps 3 and 4",
         instead="initial map fitted to 10 landmarks", see="method/initial_map", of="initial maps",
         pair=True,
         more="Nearest neighbours are found after ICP.  If poses differ a lot, the best of several "
         "initial maps is used")
     initial_refinement: str = network("always",
-        "refine initial maps by one ZoomOut iteration: in the network and for single pairs "
+        "refine initial maps by one ZoomOut iteration: in the network and in s4a.match_pair "
         "(always), in the network only (network), or never",
         choices=("always", "network", "never"), paper="network", section="4.2",
         instead="one ZoomOut iteration before Consistent ZoomOut", see="method/initial_map",
@@ -349,13 +349,13 @@ class Options:
         more="The number must be at least 2 k.  The initial refinement also uses the samples if "
         "pose differences are small")
     dense_iterations: int = network(4,
-        "number of final Consistent ZoomOut iterations that also search between the samples",
+        "final Consistent ZoomOut iterations that also search the vertices around each match",
         paper=0, fast=0, section="eq. 3", see="method/latent",
         more="Matches between samples alone are only as accurate as the spacing of the samples.  "
-        "These iterations also search the vertices around each match.  With ``n_samples=0`` all "
+        "With ``n_samples=0`` all "
         "vertices are searched anyway")
     norm: str = network("h2",
-        "norm of the shape differences; the shape with the smallest norm is the median",
+        "norm that selects the median shape: the shape difference with the smallest norm",
         choices=("h2", "h1", "frobenius", "h2_image", "h2_both"), section="eq. 5",
         more="'frobenius' weights all eigenfunctions equally.  'h1' gives fine detail less weight, "
         "and 'h2' even less.  'h2_image' gives fine detail more weight.  'h2_both' gives fine "
@@ -384,12 +384,12 @@ class Options:
         paper=False, section="eq. 8", see="method/deform", of="registration", pair=True,
         more="Otherwise one rigid transform applies to the whole shape")
     full_resolution_iterations: int = registration(1,
-        "number of ZoomOut iterations of a single pair that search all vertices of the source",
+        "s4a.match_pair and transfer only: ZoomOut iterations that search all source vertices",
         paper=0, section="eq. 4", instead="after ZoomOut on coarse vertices", see="method/register",
-        pair=True, more="They follow ZoomOut on coarse vertices.  An external mesh of a transfer "
-        "and the template are a single pair, too")
+        pair=True, more="They follow ZoomOut on coarse vertices.  Also used when an external mesh "
+        "is matched to the template")
     bidirectional: bool = registration(True,
-        "match single pairs in both directions and average the transfer over both",
+        "transfer only: match pairs in both directions and average the results",
         paper=False, section="6.2", instead="a template registered to a shape",
         see="analysis/transfer", pair=True, more="It is an option of :func:`s4a.register_pairs`")
     alignment: str = registration("fitted",
@@ -411,12 +411,13 @@ class Options:
     intersections: bool = quality(True,
         "count self-intersecting triangles: those that intersect others of the same shape")
     quality_control: str = quality("exclude",
-        "flagged shapes are excluded from the network, or the run stops",
+        "suspect (flagged) shapes, such as mirrored ones, are excluded, or the run stops",
         choices=("exclude", "stop"),
         more="A flagged shape, such as a mirrored one or one in another unit, is left out of the "
         "network and of the modes.  It is registered afterwards, with the results of the others "
         "held fixed.  With 'stop' the run ends before the long stages")
-    include_flagged: bool = quality(False, "include flagged shapes in the modes and statistics")
+    include_flagged: bool = quality(False,
+        "include suspect (flagged) shapes in the modes and statistics")
     # fmt: on
 
     def __post_init__(self):

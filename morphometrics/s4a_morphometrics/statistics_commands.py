@@ -19,7 +19,7 @@ def fields(
     Parameters
     ----------
     study : STUDY
-        its folder
+        folder of the study
     folder : FOLDER
         one file per shape: NPY, NPZ, PLY, CSV, GIFTI or FreeSurfer's curv
     name : NAME
@@ -66,7 +66,7 @@ def field_statistics(
     Parameters
     ----------
     study : STUDY
-        its folder
+        folder of the study
     field : FIELD
         name of a field of s4a fields
     group : COLUMN
@@ -82,7 +82,7 @@ def field_statistics(
     include_flagged
         include flagged shapes
     permutations : N
-        of every test (default: 9999, at every vertex 999, of classes 99)
+        permutations per test (default: 9999; 999 at every vertex; 99 for classification)
     out : FOLDER
         for netCDF and CSV (default: STUDY/statistics)
     """
@@ -129,12 +129,12 @@ def region_statistics(
     out: str | None = None,
     seed: int,
 ) -> int:
-    """Evaluate and test a region of the template, without nuisances, or with size restored.
+    """Evaluate and test a region of the template, adjusted for covariates or with size restored.
 
     Parameters
     ----------
     study : STUDY
-        its folder
+        folder of the study
     region : LABEL
         only vertices of the template with these labels
     labels : FILE
@@ -143,7 +143,7 @@ def region_statistics(
     min_confidence : SHARE
         only vertices whose mean confidence is this large, 0 to 1
     regress_out : COLUMN
-        nuisances: the variation along their regression is removed from all shapes
+        covariates whose effect (by regression) is removed from all shapes
     restore_size
         restore the size that --remove-size removed
     group : COLUMN
@@ -159,7 +159,7 @@ def region_statistics(
     include_flagged
         include flagged shapes
     permutations : N
-        of every test (default: 9999, at every vertex 999, of classes 99)
+        permutations per test (default: 9999; 999 at every vertex; 99 for classification)
     out : FOLDER
         for netCDF and CSV (default: STUDY/statistics)
     """
@@ -182,7 +182,7 @@ def restricted(
     labels: str | None,
     min_confidence: float,
 ) -> "xr.DataTree":
-    """Return the study restricted to a region, without nuisances, or with size restored."""
+    """Return the study restricted to a region, adjusted for covariates, or with size."""
     import s4a_morphometrics as m
 
     changes = []
@@ -223,7 +223,7 @@ def generalization(
     Parameters
     ----------
     study : STUDY
-        its folder
+        folder of the study
     include_flagged
         include flagged shapes
     out : FOLDER

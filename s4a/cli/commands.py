@@ -174,7 +174,7 @@ def verify(study: str) -> int:
     Parameters
     ----------
     study : STUDY
-        its folder
+        folder of the study
     """
     found = s4a.verify(study)
     write(tables.verify_lines(found))
@@ -187,7 +187,7 @@ def status(study: str) -> int:
     Parameters
     ----------
     study : STUDY
-        its folder
+        folder of the study
     """
     write(tables.status_lines(s4a.study.progress.status(study), time.time()))
     return 0
@@ -206,7 +206,7 @@ def view(
     Parameters
     ----------
     study : STUDY
-        its folder
+        folder of the study
     page : FILE
         file to write (default: STUDY/study.html)
     title : TITLE
@@ -240,7 +240,7 @@ def statistics(
     Parameters
     ----------
     study : STUDY
-        its folder
+        folder of the study
     group : COLUMN
         column of groups: test and map their difference, and classify the shapes
     regress_on : COLUMN
@@ -254,7 +254,7 @@ def statistics(
     include_flagged
         include flagged shapes
     permutations : N
-        number of permutations of every test (default: 9999, at every vertex 999, of classes 99)
+        permutations per test (default: 9999; 999 at every vertex; 99 for classification)
     out : FOLDER
         folder for netCDF and CSV files (default: STUDY/statistics)
     """
@@ -356,7 +356,7 @@ def insert(
     Parameters
     ----------
     study : STUDY
-        its folder
+        folder of the study
     shapes : SHAPE
         mesh files, label volumes, folders or globs
     out : FOLDER
@@ -394,7 +394,8 @@ def transfer(
     source : SOURCE
         mesh file that the labels and landmarks belong to
     targets : TARGET
-        mesh files, folders or globs; or one study folder, whose options are the defaults
+        mesh files, folders or globs; or one study folder, whose options are used
+        unless you give others
     labels : FILE
         labels of the source's vertices: NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer
         annot, also .gz
@@ -403,7 +404,7 @@ def transfer(
     out : FOLDER
         folder for <target>.labels.npy, .confidence.npy, .landmarks.csv
     blur : X
-        radius within which votes for labels count, in multiples of the uncertainty of the match
+        smooth the votes for labels over this multiple of the estimated match error; 0: not at all
         (default: 1; 0 with --preset paper)
     """
     if not (labels or source_landmarks):
@@ -523,16 +524,16 @@ def compare(
     collection : PATH
         folders, globs or mesh files of the collection of Table 2
     methods : METHOD
-        some of kNN, ZO, FMAP+ZO, SCALABLE, RE-MATCH, RE-MATCH refined, registered, registered
-        surface
+        some of kNN, ZO, FMAP+ZO, SCALABLE, RE-MATCH, 'RE-MATCH refined', registered,
+        'registered surface' (quote names with spaces)
     truth : FILE
-        ground truth for each target, NPY or text: for every vertex of its file the vertex of the
-        source (from 0; -1: none), or x, y, z
+        one file per target (NPY or text) with one row per vertex of the target: index of the
+        source vertex (from 0; -1 for none), or its x, y, z
     landmarks : PATH
         landmark files of the source and of each target, whose common names guide registration:
         Slicer .mrk.json, CSV or MeshLab .pp
     keep
-        also write meshes, matches and maps to compare.nc, for the panel that shows them
+        also write meshes, matches and maps to compare.nc, for s4a.widgets.Comparison
     out : FOLDER
         folder for compare.nc and compare.png
     """
