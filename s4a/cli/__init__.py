@@ -22,7 +22,7 @@ from s4a.extensions import extensions
 __all__ = ["Command", "add_options", "command", "main", "number_or_name", "parser", "whole"]
 
 PAGE = "https://github.com/OWNER/s4a/blob/HEAD/docs/commands.md"
-PAPER = "Sections and equations are those of the paper, Maccarone et al."
+LINKS = f"documentation: {PAGE}\nSections and equations are those of the paper, Maccarone et al."
 
 
 class Parser(argparse.ArgumentParser):
@@ -102,9 +102,7 @@ def parser(only: str | None = None) -> Parser:
             sub("-q", "--quiet", action="store_true", help="no progress bar and no warnings")
             sub.usage = f"{sub.usage} [options]"
             examples = textwrap.indent(f"{one.examples}\n", "  ") if one.examples else ""
-            sub.epilog = (
-                f"examples:\n{examples}\n" * bool(examples) + f"documentation: {PAGE}\n{PAPER}"
-            )
+            sub.epilog = f"examples:\n{examples}\n" * bool(examples) + LINKS
         sub.set_defaults(function=one.run, flags=sub.flags)
     if only and only not in commands:
         top.error(f"{only!r} is not a command{suggestion(only, commands)}")
