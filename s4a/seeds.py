@@ -1,14 +1,10 @@
-"""Random numbers: ``rng=`` beside ``seed=``, as SPEC 7 of Scientific Python has it.
+"""Random numbers: ``rng=`` as an alternative to ``seed=`` (Scientific Python SPEC 7).
 
-What is random here depends on a whole number, so that a study can say in its report how it is made
-again.  Every public function that takes it as ``seed`` also takes ``rng``: a whole number, which is
-the same as that seed; or a :class:`numpy.random.Generator`, from which the number is drawn, so that
-a second call with the same generator gets another one.  Unlike in SPEC 7, None is no fresh entropy
-but the default of ``seed``: a result that cannot be repeated has to be asked for, with
-``rng=numpy.random.default_rng()``.
-
-``seed=`` stays without a warning in every 0.x, 1.0 will warn of it, and no release before 1.2 will
-refuse it.  The options of a study and of the command line keep it: there it is a number on record.
+The report of a study stores an integer seed, so that a result can be repeated.  Every public
+function with ``seed`` also takes ``rng``: an integer, with the same meaning as `seed`, or a
+:class:`numpy.random.Generator`, from which a seed is drawn, so that a second call with the same
+generator gets another seed.  Unlike in SPEC 7, None means the default of ``seed`` and not fresh
+entropy; for the latter pass ``rng=numpy.random.default_rng()``.
 """
 
 from typing import Any
@@ -16,25 +12,25 @@ from typing import Any
 import numpy as np
 
 RNG = int | np.integer | np.random.Generator
-LARGEST = 2**31  # of a drawn seed, which every library takes
+LARGEST = 2**31  # upper limit of a drawn seed, valid in all libraries
 
 
 def seed_of(seed: int, rng: RNG | None) -> int:
-    """The seed that a function is to take.
+    """Return the seed to use.
 
     Parameters
     ----------
     seed : int
-        As given, 0 where it is not.
+        Seed of the caller, by default 0.
     rng : int, Generator or None
-        Another way to give it.
+        Alternative to `seed`.
 
     Raises
     ------
     TypeError
-        When `rng` is neither.
+        If `rng` has another type.
     ValueError
-        When both are given.
+        If both are given, or `rng` is negative.
 
     Examples
     --------
@@ -60,7 +56,7 @@ def seed_of(seed: int, rng: RNG | None) -> int:
 
 
 def seeded(options: dict[str, Any]) -> dict[str, Any]:
-    """Options with ``seed`` in the place of ``rng``, where that is given.
+    """Replace ``rng`` in options by ``seed``, if it is given.
 
     Examples
     --------

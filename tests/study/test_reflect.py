@@ -91,14 +91,14 @@ def test_the_command_takes_a_column_of_the_table(mixed, tmp_path, capsys):
 
 
 @pytest.fixture(scope="module")
-def newcomer():
+def new_mirrored():
     """Another right shape, and the left one that is its mirror image."""
     X, T = faulty.shape(310)
     return (X, T), (X * [-1, 1, 1], T[:, ::-1])
 
 
-def test_a_new_shape_of_the_other_side_is_mirrored_on_request(newcomer, folder, tmp_path):
-    right, left = newcomer
+def test_a_new_shape_of_the_other_side_is_mirrored_on_request(new_mirrored, folder, tmp_path):
+    right, left = new_mirrored
     with open_study(folder) as study:
         known = s4a.insert(study, {"s9": right}, n_jobs=1)
         for reflect in ("auto", "s9", ["s9"]):
@@ -119,9 +119,9 @@ def test_a_new_shape_of_the_other_side_is_mirrored_on_request(newcomer, folder, 
     assert np.linalg.norm(points.mean(0) - left[0].mean(0)) < 0.05 * np.ptp(left[0], axis=0).max()
 
 
-def test_a_new_shape_of_the_other_side_is_flagged_by_default(newcomer, folder):
+def test_a_new_shape_of_the_other_side_is_flagged_by_default(new_mirrored, folder):
     with open_study(folder) as study:
-        result = s4a.insert(study, {"s9": newcomer[1]}, n_jobs=1)
+        result = s4a.insert(study, {"s9": new_mirrored[1]}, n_jobs=1)
     report = result["report"].sel(shape="s9")
     assert report["status"].item() == "flagged"
     assert "reflect= mirrors it" in report["warning"].item()
@@ -129,10 +129,10 @@ def test_a_new_shape_of_the_other_side_is_flagged_by_default(newcomer, folder):
 
 
 def test_an_undetermined_side_is_reported_and_an_unknown_name_is_an_error(
-    newcomer, folder, study, meshes, caplog
+    new_mirrored, folder, study, meshes, caplog
 ):
     with pytest.raises(ValueError, match=r"'s8' is not a new shape \(s9\)"):
-        s4a.insert(open_study(folder), {"s9": newcomer[0]}, reflect="s8", n_jobs=1)
+        s4a.insert(open_study(folder), {"s9": new_mirrored[0]}, reflect="s8", n_jobs=1)
     brain = meshes["brain_02"]
     result = s4a.insert(study, {"again": brain}, reflect="auto", n_jobs=1)
     message = "reflect='auto' left again as it is: the shapes of the study are too symmetric"
@@ -141,8 +141,8 @@ def test_an_undetermined_side_is_reported_and_an_unknown_name_is_an_error(
     assert result["report"]["reflected"].values.tolist() == [0]
 
 
-def test_the_command_of_new_shapes_mirrors_them_too(newcomer, folder, tmp_path, capsys):
-    s4a.write_mesh(tmp_path / "s9.ply", *newcomer[1])
+def test_the_command_of_new_shapes_mirrors_them_too(new_mirrored, folder, tmp_path, capsys):
+    s4a.write_mesh(tmp_path / "s9.ply", *new_mirrored[1])
     command = ["insert", str(folder), str(tmp_path / "s9.ply"), "--out", str(tmp_path / "out")]
     assert cli.main([*command, "--reflect", "auto", "--n-jobs", "1"]) == 0
     assert "mirror image" not in capsys.readouterr().out
