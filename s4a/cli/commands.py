@@ -350,6 +350,7 @@ def insert(
     landmarks: str | None = None,
     reflect: str | None = None,
     n_jobs: int,
+    **system: Any,
 ) -> int:
     """Register new shapes to a finished study, which stays unchanged.
 
@@ -367,7 +368,8 @@ def insert(
         new shapes to mirror: names separated by commas; or auto, those mirrored to the study
     """
     tree = s4a.open_study(study)
-    inserted = s4a.insert(tree, shapes, landmarks=landmarks, reflect=reflect, n_jobs=n_jobs)
+    given = {"landmarks": landmarks, "reflect": reflect, "n_jobs": n_jobs} | system
+    inserted = s4a.insert(tree, shapes, **given)
     folder = new_folder(out)
     path = s4a.study.tree.write_inserted(inserted, folder)
     s4a.write_registered(inserted, folder)
@@ -497,7 +499,7 @@ def file_points(mesh: "xr.Dataset") -> "np.ndarray":
     path, label = mesh.attrs.get("path") or "", mesh.attrs.get("label")
     if Path(path).is_file():
         read = s4a.input.labels.read_volume(path, label) if label else s4a.read_mesh(path)
-        return s4a.input.chirality.in_file(mesh, read[0])
+        return s4a.input.chirality.in_file(mesh, read[0], back=True)
     points = np.full((mesh.sizes["file_vertex_index"], 3), np.nan)
     points[mesh["file_vertex"].values] = mesh["position"].values
     return points
@@ -659,7 +661,8 @@ def write(*texts: str) -> None:
 
 
 OF_PAIRS = [name for name, one in DECLARED.items() if one.metadata["pair"]]
-CLEANING = ("components", "pattern", "label", "strict", "close_holes", "intersections")
+SYSTEM = ("coordinate_system", "unit")
+CLEANING = ("components", "pattern", "label", "strict", "close_holes", "intersections", *SYSTEM)
 COMMANDS = {
     "doctor": command(doctor),
     "check": command(check, CLEANING),
@@ -669,7 +672,7 @@ COMMANDS = {
     "demo": command(demo, ("preset", "n_jobs", "seed")),
     "view": command(view),
     "statistics": command(statistics, ("seed",)),
-    "insert": command(insert, ("n_jobs",)),
+    "insert": command(insert, ("n_jobs", *SYSTEM)),
     "transfer": command(transfer, (*OF_PAIRS, "n_jobs"), unset=True),
     "compare": command(compare, ("n_coarse", "n_pairs", "k", "preset", "seed")),
 }

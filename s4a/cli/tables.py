@@ -118,10 +118,11 @@ def report_table(report: "xr.Dataset") -> str:
         shape = report.sel(shape=name)
         counts = [int(shape[count]) if count in shape else -1 for count in COUNTS]
         cells = ["-" if count < 0 else count for count in counts]
-        rows.append([name, *cells, shape["status"].item()])
+        system = shape["coordinate_system"].item() if "coordinate_system" in shape else ""
+        rows.append([name, *cells, shape["status"].item(), system])
         warning = shape["warning"].item()
         texts.append([shape["reason"].item(), f"warning: {warning}" if warning else ""])
-    head, *lines = table(rows, ["shape", *COUNTS.values(), "status"]).splitlines()
+    head, *lines = table(rows, ["shape", *COUNTS.values(), "status", "coordinates"]).splitlines()
     whole = [head]
     for line, below in zip(lines, texts, strict=True):
         whole.append(line)

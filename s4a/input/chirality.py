@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import xarray as xr
 
+from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved, transformed
 from s4a.input.subjects import listed
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -36,23 +37,17 @@ def mirror_image(mesh: xr.Dataset) -> xr.Dataset:
     >>> abs(volume(*as_arrays(image)) - volume(*as_arrays(mesh))) < 1e-9
     True
     """
-    image = mesh.copy()
-    for name in ("position", "landmark_position", "guide_position"):
-        if name in mesh:
-            image[name] = mesh[name].copy(data=mesh[name].values * MIRROR)
-    for name in ("landmark_barycentric", "guide_barycentric"):
-        if name in mesh:
-            image[name] = mesh[name].copy(data=mesh[name].values[:, ::-1])
-    flipped = np.ascontiguousarray(mesh["corner_vertex"].values[:, ::-1])
-    image["corner_vertex"] = mesh["corner_vertex"].copy(data=flipped)
+    image = transformed(mesh, np.diag([*MIRROR, 1.0]))
     reasons = [mesh.attrs.get("reason", ""), "mirrored by reflect="]
     reflected = 1 - mesh.attrs.get("reflected", 0)
     return image.assign_attrs(reflected=reflected, reason="; ".join(filter(None, reasons)))
 
 
-def in_file(mesh: xr.Dataset, X: np.ndarray) -> np.ndarray:
-    """Transform points ``(n, 3)`` of a mesh to the frame of its file, or back."""
-    return X * MIRROR if mesh.attrs.get("reflected") else X
+def in_file(mesh: xr.Dataset, X: np.ndarray, *, back: bool = False) -> np.ndarray:
+    """Transform points ``(n, 3)`` of a mesh to the coordinates of its file, or back."""
+    M = np.diag([*MIRROR, 1.0]) if mesh.attrs.get("reflected") else np.eye(4)
+    M = map_between(CoordinateSystem.of(mesh.attrs), file_system(mesh.attrs), "a mesh") @ M
+    return moved(X, np.linalg.inv(M) if back else M)
 
 
 def mean_chirality(comparisons: Mapping[str, xr.Dataset]) -> np.ndarray:

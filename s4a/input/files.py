@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from s4a.input.coordinates import CoordinateSystem, system_in
 from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
-from s4a.input.labels import VOLUMES, is_volume
+from s4a.input.labels import VOLUMES, grid_of, is_volume
 from s4a.input.raw import check_there, content, regular_file, shown
 
 SUFFIXES = {suffix: name for name, kind in FORMATS.items() for suffix in kind.suffixes.split()}
@@ -43,8 +44,8 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
         As in the file, including non-finite ones; for STL, the distinct corners.
     triangles : int32 ndarray (m, 3)
     attrs : dict of str
-        ``format``; ``coordinate_system`` (RAS or LPS) and ``unit`` if the file has them; ``note``
-        if the suffix is that of another format.
+        ``format``; ``coordinate_system`` and ``unit`` if the file has them
+        (:mod:`s4a.input.coordinates`); ``note`` if the suffix is that of another format.
 
     Raises
     ------
@@ -78,16 +79,22 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
         with np.errstate(all="ignore"):  # invalid numbers are an error here or cleaned later
             points, triangles, attrs = FORMATS[name].read(data)
             points, triangles = _checked(points, triangles)
+            attrs = {"format": name, **attrs, **system_in(data, name).attrs}
     except Exception as error:  # no file may end the run over a collection
         why = shown(error) or type(error).__name__
         raise ValueError(f"{shown(path)} cannot be read as {name}: {why}") from error
-    attrs = {"format": name, **attrs}
-    space = re.search(rb"SPACE=(RAS|LPS)", data[:1000])  # 3D Slicer writes this into any header
-    if space:
-        attrs["coordinate_system"] = space[1].decode()
     if SUFFIXES.get(suffix_of(path), name) != name:
         attrs["note"] = f"named {path.suffix} but read as {name} by its content; rename the file"
     return points, triangles, attrs
+
+
+def system_of(path: str | os.PathLike[str]) -> CoordinateSystem | None:
+    """Return the coordinate system of a mesh file or volume; None if the file cannot be read."""
+    try:
+        data = content(path).removeprefix(b"\xef\xbb\xbf")
+        return grid_of(data)[2] if is_volume(data) else system_in(data, format_of(data))
+    except Exception:  # reading the shape will raise the error
+        return None
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str:
@@ -138,6 +145,9 @@ def write_mesh(
     path: str | os.PathLike[str],
     points: np.ndarray,
     triangles: np.ndarray,
+    *,
+    coordinate_system: str = "",
+    unit: str = "",
     **vertex_scalars: np.ndarray,
 ) -> None:
     """Write a mesh file in the format of its suffix.
@@ -148,6 +158,9 @@ def write_mesh(
         Name ending in .ply (binary), .obj, .off, .stl, .vtk, .vtp, .gii or .npz.
     points : float ndarray (n, 3)
     triangles : int ndarray (m, 3)
+    coordinate_system, unit : str, optional
+        Written into the header if it has axes only, such as RAS or LPS, as 3D Slicer does; GIFTI
+        needs RAS and mm, and NPZ has no header.
     **vertex_scalars : float ndarray (n,)
         Values per vertex by name, in PLY, VTK, VTP, GIFTI (float32) and NPZ.
 
@@ -187,7 +200,8 @@ def write_mesh(
         raise ValueError(
             f"{suffix} cannot hold values per vertex; write .ply, .vtk, .vtp, .gii or .npz"
         )
-    path.write_bytes(WRITERS[suffix](points, triangles, scalars))
+    system = CoordinateSystem.of({"coordinate_system": coordinate_system, "unit": unit})
+    path.write_bytes(WRITERS[suffix](points, triangles, scalars, system.title))
 
 
 # the files of a collection

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from s4a.geometry.mesh import directed_edges
+from s4a.input.coordinates import CoordinateSystem, nifti_system
 from s4a.input.raw import check_there, content, reading
 from s4a.options import check_label
 
@@ -47,7 +48,7 @@ def read_volume(
     Returns
     -------
     points : float64 ndarray (n, 3)
-        In millimetres, RAS if the file has an orientation.
+        In millimetres, RAS if the file has an orientation (:mod:`s4a.input.coordinates`).
     triangles : int32 ndarray (m, 3)
         Counter-clockwise seen from outside.
     attrs : dict of str
@@ -69,7 +70,7 @@ def read_volume(
     points = points @ affine[:3, :3].T + affine[:3, 3]
     if np.linalg.det(affine[:3, :3]) < 0:
         triangles = triangles[:, ::-1]
-    attrs |= {"label": str(checked), "unit": "mm"}
+    attrs |= {"label": str(checked)}
     if at_border:
         closed = "the structure reaches the border of the volume, and was closed there"
         attrs["note"] = "; ".join(filter(None, [attrs.get("note"), closed]))
@@ -85,8 +86,10 @@ def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarra
     return _marked(values, check_label(label)), affine
 
 
-def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], np.ndarray]:
-    """Read the shape of a volume, of labels or grey values, and its affine map to mm, RAS.
+def read_grid(
+    path: str | os.PathLike[str],
+) -> tuple[tuple[int, ...], np.ndarray, CoordinateSystem]:
+    """Read the shape of a volume, of labels or grey values, its affine map, and its system.
 
     Raises
     ------
@@ -95,16 +98,24 @@ def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], np.ndarray
     """
     check_there(path)
     with reading(path, "a volume"):
-        kind, name = _kind_of(data := content(Path(path), _UNPACKED))
-        header = kind.header_class.from_fileobj(io.BytesIO(data))
-        return _shape_of(header), _affine_of(header, name)[0]
+        return grid_of(content(Path(path), _UNPACKED))
+
+
+def grid_of(data: bytes) -> tuple[tuple[int, ...], np.ndarray, CoordinateSystem]:
+    """Return shape, affine map and coordinate system of a volume; see :func:`read_grid`."""
+    kind, name = _kind_of(data)
+    header = kind.header_class.from_fileobj(io.BytesIO(data))
+    affine, is_oriented = _affine_of(header, name)
+    codes = [0, 2] if name == "MGH" else [int(header[f"{form}form_code"]) for form in "qs"]
+    system = nifti_system(codes[1] or codes[0]) if is_oriented else CoordinateSystem(unit="mm")
+    return _shape_of(header), affine, system
 
 
 def _volume(data):
     """Labels (x, y, z), affine map of indices to millimetres, and attributes."""
     kind, name = _kind_of(data)
     header = kind.header_class.from_fileobj(io.BytesIO(data))
-    shape = _shape_of(header)
+    shape, affine, system = grid_of(data)
     needed = int(np.prod(shape, dtype=object)) * header.get_data_dtype().itemsize
     n_bytes = 284 if name == "MGH" else 352
     if needed + n_bytes > len(data):
@@ -114,10 +125,8 @@ def _volume(data):
         if values.dtype.kind != "f" or not np.array_equal(values, np.round(values)):
             raise ValueError("integers expected: this is not a label volume")
         values = values.astype(np.int64)
-    affine, is_oriented = _affine_of(header, name)
     note = "the volume has no orientation, left and right may be exchanged"
-    frame = {"coordinate_system": "RAS"} if is_oriented else {"note": note}
-    return values, affine, {"format": name} | frame
+    return values, affine, {"format": name} | system.attrs | ({} if system.axes else {"note": note})
 
 
 def _kind_of(data):
