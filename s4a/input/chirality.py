@@ -6,6 +6,7 @@ eigenvector of the matrix of comparisons, so that no single shape decides.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -43,10 +44,15 @@ def mirror_image(mesh: xr.Dataset) -> xr.Dataset:
     return image.assign_attrs(reflected=reflected, reason="; ".join(filter(None, reasons)))
 
 
+def map_to_file(attrs: Mapping[Any, Any]) -> np.ndarray:
+    """Return the map (4, 4) of a mesh with these attributes to the coordinates of its file."""
+    M = np.diag([*MIRROR, 1.0]) if attrs.get("reflected") else np.eye(4)
+    return map_between(CoordinateSystem.of(attrs), file_system(attrs), "a mesh") @ M
+
+
 def in_file(mesh: xr.Dataset, X: np.ndarray, *, back: bool = False) -> np.ndarray:
     """Transform points ``(n, 3)`` of a mesh to the coordinates of its file, or back."""
-    M = np.diag([*MIRROR, 1.0]) if mesh.attrs.get("reflected") else np.eye(4)
-    M = map_between(CoordinateSystem.of(mesh.attrs), file_system(mesh.attrs), "a mesh") @ M
+    M = map_to_file(mesh.attrs)
     return moved(X, np.linalg.inv(M) if back else M)
 
 

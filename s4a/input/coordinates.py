@@ -112,9 +112,9 @@ class CoordinateSystem:
     @property
     def title(self) -> str:
         """Title of a mesh file, from which 3D Slicer reads the axes; empty if they are unknown."""
-        return (
-            f"S4A SPACE={self.axes}" + f" UNIT={self.unit}" * bool(self.unit) if self.axes else ""
-        )
+        unit = f" UNIT={self.unit}" if self.unit else ""
+        placed = " ORIGIN=unknown" if self.origin in (UNKNOWN, SURFACE) else ""
+        return f"S4A SPACE={self.axes}{unit}{placed}" if self.axes else ""
 
     def __str__(self) -> str:
         return ", ".join(self.attrs.values()) if self.axes else f"unknown {self.unit}".strip()
@@ -329,8 +329,9 @@ def system_in(data: bytes, kind: str) -> CoordinateSystem:
         axes = field[1].decode() if field else ""
     if kind == "VTP" and not space and b"SPACE" in data:
         axes = next(iter(VtkXml(data).strings("SPACE")), "")
+    origin = UNKNOWN if b" ORIGIN=unknown" in head else ""
     default = "mm" if axes and (not space or b"Slicer" in head) else ""
-    return CoordinateSystem(axes, "", unit[1].decode() if unit else default)
+    return CoordinateSystem(axes, origin, unit[1].decode() if unit else default)
 
 
 def _of_freesurfer(data):

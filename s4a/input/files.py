@@ -1,5 +1,6 @@
 """Mesh files: read and write triangle meshes, and find the files of a collection (5, the data)."""
 
+import contextlib
 import fnmatch
 import glob
 import hashlib
@@ -8,13 +9,13 @@ import re
 import unicodedata
 import zipfile
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from s4a.input.coordinates import CoordinateSystem, system_in
+from s4a.input.coordinates import CoordinateSystem, map_between, moved, system_in
 from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
 from s4a.input.labels import VOLUMES, grid_of, is_volume
 from s4a.input.raw import check_there, content, regular_file, shown
@@ -88,13 +89,21 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
     return points, triangles, attrs
 
 
-def system_of(path: str | os.PathLike[str]) -> CoordinateSystem | None:
-    """Return the coordinate system of a mesh file or volume; None if the file cannot be read."""
-    try:
-        data = content(path).removeprefix(b"\xef\xbb\xbf")
-        return grid_of(data)[2] if is_volume(data) else system_in(data, format_of(data))
-    except Exception:  # reading the shape will raise the error
-        return None
+def systems_of(shapes: Mapping[str, Any], given: CoordinateSystem) -> dict[str, CoordinateSystem]:
+    """Return the coordinate systems of files and meshes by name, without unreadable files.
+
+    `given` says what they leave open.
+    """
+    systems = {}
+    for name, shape in shapes.items():
+        if not isinstance(shape, str | os.PathLike):
+            systems[name] = CoordinateSystem.of(getattr(shape, "attrs", {})).filled(given)
+            continue
+        with contextlib.suppress(Exception):  # reading the shape will raise the error
+            data = content(Path(shape)).removeprefix(b"\xef\xbb\xbf")
+            own = grid_of(data)[2] if is_volume(data) else system_in(data, format_of(data))
+            systems[name] = own.filled(given)
+    return systems
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str:
@@ -159,8 +168,8 @@ def write_mesh(
     points : float ndarray (n, 3)
     triangles : int ndarray (m, 3)
     coordinate_system, unit : str, optional
-        Written into the header if it has axes only, such as RAS or LPS, as 3D Slicer does; GIFTI
-        needs RAS and mm, and NPZ has no header.
+        Written into the header, as 3D Slicer does, but for NPZ.  Coordinates in FreeSurfer's
+        surface RAS are converted to scanner RAS, and those of GIFTI to RAS and mm.
     **vertex_scalars : float ndarray (n,)
         Values per vertex by name, in PLY, VTK, VTP, GIFTI (float32) and NPZ.
 
@@ -201,7 +210,10 @@ def write_mesh(
             f"{suffix} cannot hold values per vertex; write .ply, .vtk, .vtp, .gii or .npz"
         )
     system = CoordinateSystem.of({"coordinate_system": coordinate_system, "unit": unit})
-    path.write_bytes(WRITERS[suffix](points, triangles, scalars, system.title))
+    written = system.in_world(*["RAS", "mm"] if suffix == ".gii" else [])
+    M = map_between(system, written, shown(path))
+    triangles = triangles[:, ::-1] if np.linalg.det(M) < 0 else triangles
+    path.write_bytes(WRITERS[suffix](moved(points, M), triangles, scalars, written.title))
 
 
 # the files of a collection

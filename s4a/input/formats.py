@@ -815,7 +815,9 @@ def _stl_bytes(X, T, _, title=""):
 def _gifti_bytes(X, T, scalars, title=""):
     from nibabel.gifti import gifti  # imported here only
 
-    space = gifti.GiftiCoordSystem(*[1 if "SPACE=RAS" in title else 0] * 2)  # of the scanner
+    space = gifti.GiftiCoordSystem(
+        *[2 if "SPACE=RAS" in title and "ORIGIN" not in title else 0] * 2
+    )
     arrays = [("POINTSET", X.astype(np.float32), {}), ("TRIANGLE", T, {})]
     for name, values in scalars.items():
         arrays.append(("SHAPE", values.astype(np.float32), {"Name": name}))

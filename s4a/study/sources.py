@@ -10,7 +10,7 @@ import xarray as xr
 from s4a.geometry.mesh import as_dataset
 from s4a.input.annotations import feature_files
 from s4a.input.coordinates import CoordinateSystem, common
-from s4a.input.files import check_names, files_named, find_meshes, system_of
+from s4a.input.files import check_names, files_named, find_meshes, systems_of
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import read_bytes, shown
 from s4a.input.subjects import is_missing, listed
@@ -103,27 +103,13 @@ def _source_of(name, mesh):
     return mesh, content_key(mesh)
 
 
-def systems_of(shapes: dict[str, Any], options: Options) -> dict[str, CoordinateSystem]:
-    """Return the coordinate systems of files and meshes by name, without unreadable files.
-
-    What a file leaves open is as in the options ``coordinate_system`` and ``unit``.
-    """
-    given = CoordinateSystem.of(vars(options))
-    found = {
-        name: system_of(mesh)
-        if isinstance(mesh, str | Path)
-        else CoordinateSystem.of(mesh.attrs if isinstance(mesh, xr.Dataset) else {})
-        for name, mesh in shapes.items()
-    }
-    return {name: system.filled(given) for name, system in found.items() if system is not None}
-
-
 def common_system(sources: Sources, options: Options) -> tuple[CoordinateSystem | None, list[str]]:
     """Return the system to convert all shapes to, None if they have one, and a remark.
 
     Raises ValueError if some systems are known and others are not.
     """
-    systems = systems_of({name: mesh for name, (mesh, _) in sources.items()}, options)
+    given = CoordinateSystem.of(vars(options))
+    systems = systems_of({name: mesh for name, (mesh, _) in sources.items()}, given)
     target = common(systems)
     others = {n: s for n, s in systems.items() if (s.axes, s.unit) != (target.axes, target.unit)}
     if not others:
