@@ -8,6 +8,7 @@ import pytest
 from paths import DATA
 
 from s4a.input.files import find_meshes, not_meshes, read_mesh, slug, write_mesh
+from s4a.input.polygons import triangulated
 
 X = np.array([[0, 0, 0], [1.5, 0, 0], [1.5, 2, 0], [0, 2, 0], [0.25, 0.5, 3]])
 T = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
@@ -143,6 +144,111 @@ def test_binary_vtk_5_is_read_with_offsets(tmp_path):
     data = head.encode() + X.astype(">f8").tobytes() + b"\nPOLYGONS 7 18\nOFFSETS vtktypeint64\n"
     data += (np.arange(7) * 3).astype(">i8").tobytes() + b"\nCONNECTIVITY vtktypeint64\n"
     same_surface(file(tmp_path, "m.vtk", data + T.astype(">i8").tobytes() + b"\n"))
+
+
+# a prism over a letter: concave at (20, 20), with a corner on a straight side, of area 8,800
+OUTLINE = np.array([[0, 0], [60, 0], [60, 20], [20, 20], [20, 60], [0, 60], [0, 30.0]])
+
+
+def prism(roll, lift=0.0):
+    """Vertices and polygons of a prism, whose first corners are chosen by `roll`."""
+    n = len(OUTLINE)
+    points = np.r_[np.c_[OUTLINE, np.zeros(n)], np.c_[OUTLINE, np.full(n, 20.0)]]
+    points[4, 2] -= lift  # then five polygons are not planar
+    sides = [[i, (i + 1) % n, n + (i + 1) % n, n + i] for i in range(n)]
+    faces = [list(range(n))[::-1], list(range(n, 2 * n)), *sides]
+    return points, [[*face[roll % len(face) :], *face[: roll % len(face)]] for face in faces]
+
+
+def polygon_files(points, faces):
+    """The prism in every format with polygons."""
+    rows = "\n".join("{} {} {}".format(*x) for x in points)
+    counted = "\n".join(f"{len(f)} {' '.join(map(str, f))}" for f in faces)
+    n, size = len(points), sum(map(len, faces))
+    flat = " ".join(str(i) for f in faces for i in f)
+    ends = " ".join(map(str, np.cumsum([len(f) for f in faces])))
+    obj = "v " + rows.replace("\n", "\nv ") + "\n"
+    yield "a.obj", obj + "".join(f"f {' '.join(str(i + 1) for i in f)}\n" for f in faces)
+    yield "a.off", f"OFF\n{n} {len(faces)} 0\n{rows}\n{counted}\n"
+    head = f"ply\nformat ascii 1.0\nelement vertex {n}\nproperty double x\nproperty double y\n"
+    head += f"property double z\nelement face {len(faces)}\n"
+    yield "a.ply", f"{head}property list uchar int vertex_indices\nend_header\n{rows}\n{counted}"
+    head = VTK_HEAD.format("3.0", "ASCII") + f"POINTS {n} double\n{rows}\nPOLYGONS {len(faces)} "
+    yield "a.vtk", f"{head}{size + len(faces)}\n{counted}\n"
+    array = '<DataArray type="{}" Name="{}" format="ascii">{}</DataArray>'.format
+    polys = array("Int64", "connectivity", flat) + array("Int64", "offsets", ends)
+    yield (
+        "a.vtp",
+        f'<VTKFile type="PolyData"><PolyData><Piece NumberOfPoints="{n}" NumberOfPolys='
+        f'"{len(faces)}"><Points>{array("Float64", "Points", rows)}</Points><Polys>{polys}'
+        "</Polys></Piece></PolyData></VTKFile>",
+    )
+
+
+def area_and_volume(points, triangles):
+    a, b, c = points[triangles].transpose(1, 0, 2)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, (a * np.cross(b, c)).sum() / 6
+
+
+def test_area_and_volume_do_not_depend_on_the_first_corner_of_a_polygon(tmp_path):
+    for lift, expected in ((0.0, (8800, 40_000)), (5.0, None)):
+        for roll in range(7):
+            for name, content in polygon_files(*prism(roll, lift)):
+                points, triangles, attrs = read_mesh(file(tmp_path, name, content))
+                found = area_and_volume(points, triangles)
+                expected = expected or found
+                np.testing.assert_allclose(found, expected, rtol=1e-12, err_msg=f"{name} {roll}")
+                assert len(triangles) == 24
+                assert "note" not in attrs
+
+
+def test_any_simple_polygon_is_covered_once():
+    rng = np.random.default_rng(0)
+    angle, radius = np.linspace(6, 20, 20), np.array([[0.0], [1.5]])
+    arms = np.stack([(angle + radius) * np.cos(angle), (angle + radius) * np.sin(angle)], axis=2)
+    tenths = np.arange(20) * np.pi / 10
+    hole = [[0, 0], [1, 1], [1, 3], [3, 3], [3, 1], [1, 1]]
+    outlines = {
+        "spiral": np.r_[arms[0], arms[1][::-1]],
+        "star": np.tile([3, 0.6], 10)[:, None] * np.c_[np.cos(tenths), np.sin(tenths)],
+        "cut to a hole": [[0, 0], [4, 0], [4, 4], [0, 4], *hole],
+        "repeated corner": [[0, 0], [1, 0], [2, 0], [2, 0], [2, 2], [1, 0.5], [0, 2]],
+        "no area": [[0, 0], [1, 0], [2, 0], [3, 0], [3, 0]],
+    }
+    for name, outline in outlines.items():
+        x, y = np.array(outline, float).T
+        expected = (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        points = np.c_[x, y, 0 * x] @ turn + 5
+        n = len(x)
+        for roll in range(0, n, 3):
+            T, n_crossing = triangulated(points, np.roll(np.arange(n), roll), np.array([n]))
+            assert area_and_volume(points, T)[0] == pytest.approx(abs(expected), abs=1e-9), name
+            assert (len(T), n_crossing) == (n - 2, 0)
+
+
+def test_a_polygon_that_intersects_itself_is_reported(tmp_path):
+    text = "OFF\n4 1 0\n0 0 0\n2 2 0\n2 0 0\n0 1 0\n4 0 1 2 3\n"
+    assert "1 polygons intersect themselves" in read_mesh(file(tmp_path, "a.off", text))[2]["note"]
+
+
+def test_triangle_strips_are_read(tmp_path):
+    rows = "\n".join("{} {} {}".format(*x) for x in X)
+    expected = [[0, 1, 2], [3, 2, 1], [2, 3, 4], [0, 4, 1]]
+    head = "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\n"
+    head += "property float z\nelement tristrips 1\nproperty list int int vertex_indices\n"
+    vtk = f"{VTK_HEAD.format('3.0', 'ASCII')}POINTS 5 float\n{rows}\nTRIANGLE_STRIPS 2 10\n"
+    array = '<DataArray type="{}" Name="{}" format="ascii">{}</DataArray>'.format
+    cells = array("Int64", "connectivity", "0 1 2 3 4 0 4 1") + array("Int64", "offsets", "5 8")
+    vtp = '<VTKFile type="PolyData"><PolyData><Piece NumberOfPoints="5" NumberOfStrips="2">'
+    vtp += f"<Points>{array('Float64', 'Points', rows)}</Points><Strips>{cells}</Strips></Piece>"
+    files = {
+        "a.ply": f"{head}end_header\n{rows}\n9 0 1 2 3 4 -1 0 4 1\n",
+        "a.vtk": f"{vtk}5 0 1 2 3 4\n3 0 4 1\n",
+        "a.vtp": f"{vtp}</PolyData></VTKFile>",
+    }
+    for name, content in files.items():
+        same_surface(file(tmp_path, name, content), X, np.array(expected))
 
 
 SEEDS = fuzz.seeds()
