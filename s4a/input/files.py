@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 
 from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
-from s4a.input.labels import VOLUMES, is_volume
+from s4a.input.labels import VOLUMES, volume_format
 from s4a.input.polygons import triangulated
 from s4a.input.raw import check_there, content, regular_file, shown
 
 SUFFIXES = {suffix: name for name, kind in FORMATS.items() for suffix in kind.suffixes.split()}
+SUFFIXES[".obj"] = "OBJ"  # and of MNI
 WRITERS = {kind.suffixes.split()[0]: kind.write for kind in FORMATS.values() if kind.write}
 LONGEST_NAME = 100  # characters of a shape's name, as files of a study are named after it
 OTHERS = ".json .csv .txt .md .html .png .jpg .nc .npy .annot .nii".split()  # not meshes
@@ -33,10 +34,10 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
     Parameters
     ----------
     path : str or Path
-        PLY, OBJ, OFF, STL, VTK legacy polydata, VTP, GIFTI, FreeSurfer surface, or NPZ with the
-        keys V and F, vertices and faces, points and triangles, position and corner_vertex, or X and
-        T.  Files may be compressed by gzip (.ply.gz).  The limit is 2 GiB, or 1 GiB unpacked.
-        Polygons are split into triangles.
+        PLY, OBJ (also of MNI), OFF, STL, VTK legacy polydata, VTP, GIFTI, FreeSurfer surface, MZ3,
+        or NPZ with the keys V and F, vertices and faces, points and triangles, position and
+        corner_vertex, or X and T.  Files may be compressed by gzip (.ply.gz).  The limit is 2 GiB,
+        or 1 GiB unpacked.  Polygons are split into triangles.
 
     Returns
     -------
@@ -73,8 +74,10 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
     name = "mesh"
     try:
         data = content(path).removeprefix(b"\xef\xbb\xbf")
-        if is_volume(data):
-            raise ValueError("found a volume; give a label (label=17, --label 17) for its surface")
+        if volume := volume_format(data):
+            raise ValueError(
+                f"found a volume ({volume}); give a label (label=17, --label 17) for its surface"
+            )
         name = format_of(data)
         with np.errstate(all="ignore"):  # invalid numbers are an error here or cleaned later
             points, cells, attrs = FORMATS[name].read(data)
@@ -86,7 +89,8 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
     space = re.search(rb"SPACE=(RAS|LPS)", data[:1000])  # 3D Slicer writes this into any header
     if space:
         attrs["coordinate_system"] = space[1].decode()
-    if SUFFIXES.get(suffix_of(path), name) != name:
+    suffix = suffix_of(path)
+    if suffix in SUFFIXES and suffix not in FORMATS[name].suffixes.split():
         notes.append(f"named {path.suffix} but read as {name} by its content; rename the file")
     if n_crossing:
         notes.append(f"{n_crossing} polygons intersect themselves; save the surface as triangles")

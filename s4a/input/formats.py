@@ -23,6 +23,7 @@ import base64
 import io
 import math
 import re
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -32,7 +33,7 @@ import numpy as np
 
 from s4a.geometry.mesh import equal_rows
 from s4a.input.polygons import Polygons, joined, polygons, strips
-from s4a.input.raw import limit_of, npz, unpack, xml
+from s4a.input.raw import is_utf_16, limit_of, npz, unpack, xml
 
 _LEGACY_TYPES = {
     "char": "i1", "unsigned_char": "u1", "short": "i2", "unsigned_short": "u2", "int": "i4",
@@ -295,7 +296,10 @@ class _Xml:
                 )
             return _take(data, w, length, is_base64)
         if self.compressor not in _COMPRESSORS:
-            raise ValueError(f"{' or '.join(_COMPRESSORS)} expected, found {self.compressor}")
+            raise ValueError(
+                f"{' or '.join(_COMPRESSORS)} expected, found {self.compressor}: save it with "
+                "compression by ZLib, or without"
+            )
         # number of blocks, size of a block, size of the last block, compressed size of each
         blocks = int(np.frombuffer(_take(data, 0, w, is_base64), self.size_type)[0])
         sizes = np.frombuffer(_take(data, 3 * w, blocks * w, is_base64), self.size_type).tolist()
@@ -359,6 +363,29 @@ class _Format:
     scalars: bool = False
 
 
+# other files that are found among meshes, by their first bytes
+_MAGICS = {
+    "an HDF5 file": rb"\x89HDF\r\n\x1a\n",
+    "a MATLAB file": rb"MATLAB \d",
+    "a glTF file": rb"glTF|\s*\{.*\"asset\"\s*:",
+    "a DICOM file": rb".{128}DICM",
+    "a MetaImage volume": rb"ObjectType\s*=",
+    "an FBX file": rb"Kaydara FBX",
+    "a Blender file": rb"BLENDER",
+    "a Gmsh file": rb"\$MeshFormat",
+    "a STEP file": rb"ISO-10303",
+    "a streamlines file": rb"TRACK\0|mrtrix tracks",
+    "an MRtrix image": rb"mrtrix image",
+    "a BrainVISA mesh": rb"(ascii|binar)(DCBA|ABCD)",
+    "a binary MNI surface": rb"p[\0-\xff]{3}[\x3c-\x3f]",
+    "an NPY array": rb"\x93NUMPY",
+    "a picture": rb"\x89PNG|\xff\xd8\xff|GIF8|II\*\0|MM\0\*",
+    "a PDF file": rb"%PDF",
+    "a compressed file": rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|\x28\xb5\x2f\xfd|Rar!",
+    "a program": rb"\x7fELF|MZ[\x80-\xff]",
+}
+
+
 def format_of(data: bytes) -> str:
     """Detect the format of a file's content, a key of :data:`FORMATS`.
 
@@ -377,16 +404,18 @@ def format_of(data: bytes) -> str:
     for name, kind in FORMATS.items():
         if kind.signature and re.match(kind.signature, head, re.DOTALL):
             return name
-    if len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
+    if re.match(rb"solid\b", head, re.I) and _STL_FACETS.search(data):
         return "STL"
-    if re.match(rb"solid\b", head, re.I) and re.search(rb"\bfacet\b|\bendsolid\b", data, re.I):
+    if is_utf_16(data):
+        raise ValueError("text in UTF-16 found: save it as UTF-8")
+    kind = next((kind for kind, magic in _MAGICS.items() if re.match(magic, data, re.DOTALL)), "")
+    if not kind and _is_binary_stl(data):
         return "STL"
-    if b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
+    if not kind and b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
         return "OBJ"
-    if b"\0" in head and len(data) >= 84:
-        return "STL"
     what = f"{len(data)} bytes" + " of an unknown format" * bool(data)
-    raise ValueError(f"one of {', '.join(FORMATS)} expected, found {what}")
+    found = f"{kind}: export the surface as one of them" if kind else what
+    raise ValueError(f"one of {', '.join(FORMATS)} expected, found {found}")
 
 
 def _integers(values):
@@ -616,22 +645,74 @@ def _read_off(data):
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
+_STL_FACETS = re.compile(rb"^[ \t]*(?:facet|endsolid)\b", re.I | re.M)  # names are free text
+
+
+def _is_binary_stl(data):
+    """Whether data have the size of a binary STL, or else plausible triangles.
+
+    Triangles of a file that is cut short, or longer than its triangles, have normals of length 1 or
+    0 and coordinates within the range of those that programs write.
+    """
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) < 134 or len(data) == 84 + 50 * count:
+        return len(data) >= 84 and len(data) == 84 + 50 * count
+    rows = np.frombuffer(data, _STL_TRIANGLE, min((len(data) - 84) // 50, max(count, 1), 1000), 84)
+    with np.errstate(all="ignore"):
+        length = np.linalg.norm(rows["normal"].astype(float), axis=1)
+        size = np.abs(rows["corner"].astype(float))
+        is_normal = (np.abs(length - 1) < 0.01) | (length == 0)
+        is_usual = (size == 0) | ((size > 1e-15) & (size < 1e15))
+    return bool(is_normal.all() and is_usual.all() and size.any())
+
+
 def _read_stl(data):
     """Distinct corners in order of appearance, and triangles: STL has no shared vertices."""
     count = int.from_bytes(data[80:84], "little")
     starts_as_ascii = re.match(rb"\s*solid\b", data, re.I) and b"\0" not in data[:1000]
     if starts_as_ascii and len(data) != 84 + 50 * count:
-        vertices = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.I)
-        n_facets = len(re.findall(rb"\bfacet\b", data, re.I))
-        _need(3 * n_facets, len(vertices), "vertices of facets")
-        _need(1, len(re.findall(rb"\bendsolid\b", data, re.I)), "endsolid")
+        vertices = re.findall(rb"^[ \t]*vertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.I | re.M)
+        words = [word.split()[0].lower() for word in _STL_FACETS.findall(data)]
+        _need(3 * words.count(b"facet"), len(vertices), "vertices of facets")
+        _need(1, words.count(b"endsolid"), "endsolid")
         corners = np.array(vertices, np.float64)
     else:
         _need(count, (len(data) - 84) // 50, "triangles")
+        if len(data) >= 84 + 50 * (count + 1):
+            raise ValueError(
+                f"{count} triangles of {84 + 50 * count} bytes expected, found {len(data)} bytes: "
+                "write each mesh to a file of its own"
+            )
         corners = np.frombuffer(data, _STL_TRIANGLE, count, 84)["corner"].reshape(-1, 3)
     first, group = equal_rows(corners)
     rank = np.argsort(np.argsort(first))
     return corners[np.sort(first)], rank[group].reshape(-1, 3), {}
+
+
+def _read_mz3(data):
+    """Triangles and points of Surf Ice and NiiVue; colours and scalars may follow."""
+    kind, m, n, skip = struct.unpack_from("<HIII", data, 2)
+    if kind & 3 != 3:
+        raise ValueError("triangles and vertices expected, found an overlay of values or colours")
+    _need(12 * (m + n), len(data) - 16 - skip, "bytes of triangles and vertices")
+    triangles = np.frombuffer(data, "<i4", 3 * m, 16 + skip).reshape(m, 3)
+    return np.frombuffer(data, "<f4", 3 * n, 16 + skip + 12 * m).reshape(n, 3), triangles, {}
+
+
+def _read_mni(data):
+    """Polygons of MNI and CIVET: points, normals, colours, ends of the polygons, corners."""
+    words = data.split()
+    n = int(words[6])
+    points = np.array(words[7 : 7 + 3 * n], np.float64)
+    _need(6 * n + 2, len(words) - 7, "numbers of points and normals")
+    m, colours = (int(word) for word in words[7 + 6 * n : 9 + 6 * n])
+    at = 9 + 6 * n + 4 * {0: 1, 1: m, 2: n}.get(colours, 1)
+    ends = np.array(words[at : at + m], np.int64)
+    corners = np.array(words[at + m :], np.int64)
+    _need(m, len(ends), "polygons")
+    found = polygons(corners, np.r_[0, ends])
+    _need(len(found[0]), len(corners), "corners of polygons")
+    return points.reshape(-1, 3), found, _BRAIN
 
 
 # containers of arrays
@@ -791,4 +872,6 @@ FORMATS = {
     "GIFTI": _Format(".gii", b"<(.*<)?GIFTI", _read_gifti, _gifti_bytes, scalars=True),
     "NPZ": _Format(".npz", rb"PK\x03\x04", _read_npz, _npz_bytes, scalars=True),
     "FreeSurfer": _Format(SURFER, rb"\xff\xff\xfe", _read_freesurfer),
+    "MZ3": _Format(".mz3", rb"MZ[\0-\x7f]\0", _read_mz3),
+    "MNI": _Format(".obj", rb"P(\s+[-+.\de]+){5}\s+\d+\s", _read_mni),
 }

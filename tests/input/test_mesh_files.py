@@ -267,7 +267,7 @@ def test_every_encoding_of_a_format_gives_the_same_surface(tmp_path, name):
         result, corners, attrs = read_mesh(file(tmp_path, f"m{SEEDS[name][0]}", content))
         np.testing.assert_allclose(result[corners], points[triangles], atol=1e-6)
         brain = {"coordinate_system": "RAS", "unit": "mm"}
-        assert attrs == {"format": name} | (brain if name in ("GIFTI", "FreeSurfer") else {})
+        assert attrs == {"format": name} | (brain if name in ("GIFTI", "FreeSurfer", "MNI") else {})
 
 
 @pytest.mark.parametrize(
@@ -292,13 +292,15 @@ def test_a_file_cut_anywhere_is_refused_with_its_name(tmp_path):
 
 
 def test_counts_beyond_the_file_are_named(tmp_path):
+    write_mesh(tmp_path / "m.stl", X, T)
+    stl = (tmp_path / "m.stl").read_bytes()
     promise = {
         "a.ply": ply("binary_little_endian").replace(
             b"element vertex 5", b"element vertex 4000000000"
         ),
         "b.ply": ply("ascii").replace(b"element face 6", b"element face 4000000000"),
         "c.off": b"OFF\n5 4000000000 0\n0 0 0\n",
-        "d.stl": b"x".ljust(80) + struct.pack("<I", 4_000_000_000) + bytes(500),
+        "d.stl": b"x".ljust(80) + struct.pack("<I", 4_000_000_000) + stl[84:],
         "e.vtk": (VTK_HEAD.format("3.0", "ASCII") + "POINTS 4000000000 float\n0 0 0\n").encode(),
     }
     for name, content in promise.items():
@@ -327,6 +329,78 @@ def test_a_ply_says_what_its_header_lacks(tmp_path, before, after, words):
     (tmp_path / "m.ply").write_text(head.replace(before, after) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     with pytest.raises(ValueError, match=f"m.ply cannot be read as PLY: .*{words}"):
         read_mesh(tmp_path / "m.ply")
+
+
+def test_a_second_ply_in_a_file_is_named(tmp_path):
+    for order in ("ascii", "binary_little_endian"):
+        with pytest.raises(ValueError, match=r"one mesh expected, found a second PLY at byte \d+"):
+            read_mesh(file(tmp_path, "m.ply", 2 * ply(order)))
+
+
+def test_text_in_utf_16_is_named(tmp_path):
+    text = "".join(f"v {x} {y} {z}\n" for x, y, z in X) + "f 1 2 3\n"
+    for encoding in ("utf-16", "utf-16-le", "utf-16-be"):
+        with pytest.raises(ValueError, match="text in UTF-16 found: save it as UTF-8"):
+            read_mesh(file(tmp_path, "m.obj", text.encode(encoding)))
+
+
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        (b"\x89HDF\r\n\x1a\n", "an HDF5 file"),
+        (b"MATLAB 5.0 MAT-file, Platform", "a MATLAB file"),
+        (b"glTF\2\0\0\0", "a glTF file"),
+        (b'{"scenes": [], "asset": {"version": "2.0"}}', "a glTF file"),
+        (b"NRRD0004\ntype: uchar\n", r"found a volume \(NRRD\); give a label"),
+        (bytes(128) + b"DICM", "a DICOM file"),
+        (b"\x89PNG\r\n\x1a\n", "a picture"),
+        (b"BZh91AY", "a compressed file"),
+        (b"MZ\x08\0" + struct.pack("<III", 0, 100, 0), "found an overlay of values or colours"),
+    ],
+)
+def test_files_of_other_kinds_are_named(tmp_path, content, words):
+    for body in (b"", bytes(400), np.arange(5000, dtype="<i4").tobytes()):
+        with pytest.raises(ValueError, match=rf"m\.stl.*{words}"):
+            read_mesh(file(tmp_path, "m.stl", content + body))
+
+
+def test_no_other_binary_file_is_read_as_stl(tmp_path):
+    rng = np.random.default_rng(0)
+    kinds = [
+        lambda n: rng.integers(0, 256, n).astype("u1"),
+        lambda n: rng.integers(0, 100, n).astype("<i4"),
+        lambda n: rng.normal(size=n).astype("<f4"),
+        lambda n: rng.normal(size=n),
+        lambda n: np.zeros(n, "u1"),
+        lambda n: np.r_[np.zeros(20, "<i4"), 5, rng.integers(-500, 500, n)].astype("<i4"),
+    ]
+    for i in range(120):
+        content = kinds[i % len(kinds)](int(rng.integers(1, 4000))).tobytes()
+        with pytest.raises(ValueError, match="unknown format"):
+            read_mesh(file(tmp_path, "m.stl", content))
+
+
+@pytest.mark.parametrize(
+    "name", ["L4", "L4 facet left", "facet L4", "L4 vertex 1 2 3", "L4 endsolid", "endfacet", ""]
+)
+def test_the_name_of_an_stl_solid_is_free_text(tmp_path, name):
+    facets = "".join(
+        " facet normal 0 0 0\n  outer loop\n"
+        + "".join("   vertex {} {} {}\n".format(*x) for x in X[t])
+        + "  endloop\n endfacet\n"
+        for t in T
+    )
+    for end in ("\n", "\r\n"):
+        text = f"solid {name}\n{facets}endsolid {name}\n".replace("\n", end)
+        same_surface(file(tmp_path, "m.stl", text))
+
+
+def test_an_stl_file_with_a_second_one_behind_is_refused(tmp_path):
+    write_mesh(tmp_path / "m.stl", X, T)
+    data = (tmp_path / "m.stl").read_bytes()
+    same_surface(file(tmp_path, "m.stl", data + b"made by hand"))
+    with pytest.raises(ValueError, match=r"6 triangles of 384 bytes expected, found 768 bytes"):
+        read_mesh(file(tmp_path, "m.stl", data + data))
 
 
 def test_indices_beyond_the_vertices_are_named(tmp_path):
