@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import stdtr
 
+from s4a.input.files import visible
 from s4a.input.subjects import is_plain_number, listed
 
 log = logging.getLogger(__name__)
@@ -29,8 +30,6 @@ _POWERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the Box-Cox transformation
 _SAME = str.maketrans(
     "аеорсухіѕјкмнтвΑΒΕΖΗΙΚΜΝΟΡΤΥΧαοινρυχ‐‑‒–—−", "aeopcyxisjkmhtbABEZHIKMNOPTYXaoivpux------"
 )
-# grapheme joiner, variation selectors, fillers of Hangul and the blank of Braille
-_UNSEEN = re.compile("[\u034f\ufe00-\ufe0f\u115f\u1160\u3164\uffa0\u2800]")
 
 
 def check_column(
@@ -253,17 +252,6 @@ def look_alikes(cells: Sequence[str]) -> list[tuple[bool, list[str]]]:
         if len(variants) > 1:
             found.append((len({*map(visible, variants)}) < len(variants), variants))
     return found
-
-
-def visible(text: str) -> str:
-    """Return a text in composed letters, without characters that cannot be seen."""
-    text = unicodedata.normalize("NFC", text)
-    kept = (
-        c
-        for c in text
-        if c.isspace() or not (unicodedata.category(c) in ("Cf", "Cc") or _UNSEEN.match(c))
-    )
-    return " ".join("".join(kept).split())
 
 
 def look(text: str) -> str:
