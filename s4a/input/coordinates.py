@@ -32,7 +32,7 @@ SURFACE, UNKNOWN = "surface", "unknown"
 XFORMS = {1: "scanner", 3: "Talairach", 4: "MNI152", 5: "template"}  # codes of NIfTI; 2 is world
 SPACES = {"SCANNER_ANAT": 1, "ALIGNED_ANAT": 2, "TALAIRACH": 3, "MNI_152": 4}  # of GIFTI
 REMEDY = (
-    "say what a file does not by coordinate_system= and unit=, or save the files in one coordinate "
+    "coordinate_system= and unit= say what a file does not; or save the files in one coordinate "
     "system"
 )
 
@@ -319,6 +319,8 @@ def system_in(data: bytes, kind: str) -> CoordinateSystem:
         return _of_freesurfer(data)
     if kind == "GIFTI":
         return _of_gifti(data)
+    if kind == "MNI":
+        return CoordinateSystem("RAS", "", "mm")
     # 3D Slicer writes this into the title or a comment of any file, and into fields of VTK files
     head = data[:1000]
     space = re.search(rb"SPACE=([RLAPSI]{3})\b", head)
