@@ -415,11 +415,13 @@ def transfer(
     into_study = len(targets) == 1 and any(Path(targets[0]).glob("**/registration.nc"))
     if into_study:
         s4a.study.store.check_is_study(Path(targets[0]))
-    mesh, label, points = s4a.read_shape(source), None, None
+    system = {name: options[name] for name in SYSTEM}
+    mesh, label, points = s4a.read_shape(source, **system), None, None
     if labels:
         label = labels_in(labels, mesh)
     if source_landmarks:
         points = s4a.input.annotations.read_landmarks(source_landmarks)
+        points = s4a.input.coordinates.with_system(points, **system)
         distance = s4a.input.landmarks.locate(points, mesh)["landmark_distance"].values
         far = f"at most {distance.max():.3g} from the surface of {source}"
         write(f"{len(distance)} landmarks, {far}")
@@ -604,8 +606,8 @@ def compare_pairs(
 
 def landmark_pairs(
     files: list[str] | None, targets: list[str]
-) -> "dict[str, list[np.ndarray]] | None":
-    """Return the positions of the landmarks that the source and each target have in common."""
+) -> "dict[str, list[xr.Dataset]] | None":
+    """Return the landmarks that the source and each target have in common."""
     if not files:
         return None
     if len(files) != 1 + len(targets):
@@ -613,20 +615,18 @@ def landmark_pairs(
             "--landmarks needs a file for the source and each target, "
             f"{1 + len(targets)}; found {len(files)}"
         )
-    source, *others = (
-        s4a.input.annotations.read_landmarks(file).set_index(landmark="landmark_name")
-        for file in files
-    )
+    source, *others = map(s4a.input.annotations.read_landmarks, files)
     pairs = {}
     for name, file, target in zip(targets, files[1:], others, strict=True):
-        both = [mark for mark in source["landmark"].values if mark in target["landmark"]]
+        names_of = [marks["landmark_name"].values.tolist() for marks in (source, target)]
+        both = [mark for mark in names_of[0] if mark in names_of[1]]
         if len(both) < 3:
             raise ValueError(
                 f"{files[0]} and {file} need 3 landmarks or more of the same names, "
                 f"found {len(both)}"
             )
-        ends = (source.sel(landmark=both), target.sel(landmark=both))
-        pairs[name] = [end["landmark_position"].values for end in ends]
+        at = [[own.index(mark) for mark in both] for own in names_of]
+        pairs[name] = [source.isel(landmark=at[0]), target.isel(landmark=at[1])]
     return pairs
 
 

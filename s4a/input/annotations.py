@@ -365,7 +365,7 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
 
 def _specimen(text, name):
     """Lines of one specimen of a TPS file."""
-    specimens = re.split(r"(?im)^\s*(?=LM3?\s*=)", text)[1:]
+    specimens = re.split(r"(?im)^(?=[ \t]*LM3?\s*=)", text)[1:]
     ids = [
         found[1] if (found := re.search(r"(?im)^ID\s*=\s*(.*?)\s*$", s)) else "" for s in specimens
     ]

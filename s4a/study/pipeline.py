@@ -16,7 +16,6 @@ from joblib import effective_n_jobs, parallel_config
 
 from s4a.input.chirality import AUTO, mean_chirality, mirrored_shapes, to_reflect
 from s4a.input.collection import remarks_on_files
-from s4a.input.coordinates import CoordinateSystem
 from s4a.input.plausibility import Flags
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
@@ -187,28 +186,22 @@ def analyse(
     if subjects is not None:
         check_one_structure(subjects)
     system, on_systems = common_system(sources, settings)
-    remarks += on_systems
     settings.check_against(list(sources))
     marked = find_guides(sources, settings.landmarks, settings.feature_names)
     with lock(store) as claim:
-        run = Run(claim, n_jobs)
+        run = Run(claim, n_jobs, system)
         if subjects is not None:
             write(with_contents(subjects, sources), run.folder / "subjects.nc")
         else:
             remarks = remarks + remarks_on_table(run.folder / "subjects.nc", sources)
         remarks = remarks + remarks_on_guides(sources, marked, settings.feature_names)
         with run.report_unforeseen():
-            run_steps(run, sources, marked, settings, remarks, system)
+            run_steps(run, sources, marked, settings, [*on_systems, *remarks])
     return open_study(store)
 
 
 def run_steps(
-    run: Run,
-    sources: Sources,
-    marked: Marked,
-    options: Options,
-    remarks: list[str],
-    system: CoordinateSystem | None,
+    run: Run, sources: Sources, marked: Marked, options: Options, remarks: list[str]
 ) -> None:
     """Run all steps of the paper; each skips files that are done."""
     # dependencies of the files; a key contains those of all files before it:
@@ -218,8 +211,8 @@ def run_steps(
     #   network/descriptor_*, comparison_*    latent/* of excluded -> registration/* <- registration
     #                                                     |
     #                                                pca, report
-    reflected, on_chirality = choose_reflected(run, sources, marked, options, system)
-    original = read_and_clean(run, sources, marked, options, reflected, system)
+    reflected, on_chirality = choose_reflected(run, sources, marked, options)
+    original = read_and_clean(run, sources, marked, options, reflected)
     original, flags, on_shapes = check_plausibility(run, original, options)
     stop_if_flagged(flags, options)
     coarse = remesh(run, original, options)
@@ -237,23 +230,14 @@ def run_steps(
 
 
 def read_and_clean(
-    run: Run,
-    sources: Sources,
-    marked: Marked,
-    options: Options,
-    reflected: list[str],
-    system: CoordinateSystem | None,
+    run: Run, sources: Sources, marked: Marked, options: Options, reflected: list[str]
 ) -> Keys:
-    """Read and clean the shapes, add landmarks and fields, mirror some (5.1): ``/original``.
-
-    If there is a `system`, axes and unit of all shapes are converted to it.
-    """
+    """Read and clean the shapes, add landmarks and fields, mirror some (5.1): ``/original``."""
     cleaning = options.of("cleaning")
     todo = []
     for n, (source, content) in sources.items():
         also: dict[str, Any] = {"reflected": True} if n in reflected else {}
-        if system is not None:
-            also["system"] = system.attrs
+        also |= {"system": run.system} if run.system else {}
         key = (content, cleaning, *also.values())
         if n in marked:
             also["guides"] = landmarks, features = marked[n]
@@ -266,11 +250,7 @@ def read_and_clean(
 
 
 def choose_reflected(
-    run: Run,
-    sources: Sources,
-    marked: Marked,
-    options: Options,
-    system: CoordinateSystem | None,
+    run: Run, sources: Sources, marked: Marked, options: Options
 ) -> tuple[list[str], list[str]]:
     """Choose the shapes to mirror; return their names, and remarks.
 
@@ -287,10 +267,9 @@ def choose_reflected(
         return reflected, ["reflect= mirrors all shapes, with no effect"] if is_all else []
     file = run.folder / CHOICE
     contents = [content for _, content in sources.values()]
-    key = task_key(list(sources), contents, options.of("cleaning"), options.k, AUTO)
-    key = key if system is None else task_key(key, system.attrs)
+    key = task_key(list(sources), contents, options.of("cleaning"), run.system, options.k, AUTO)
     if not is_done(file, key):
-        original = read_and_clean(run, sources, marked, options, [], system)
+        original = read_and_clean(run, sources, marked, options, [])
         comparisons = comparisons_of(run, original, options) if len(original) > 1 else {}
         reflected, remarks = mirrored_shapes(comparisons)
         choice = dataset(
