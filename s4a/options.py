@@ -9,7 +9,7 @@ import difflib
 import json
 import re
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import partial
 from importlib.util import find_spec
@@ -435,6 +435,11 @@ class Options:
         "include suspect (flagged) shapes in the modes and statistics")
     # fmt: on
 
+    def __new__(cls, **given: Any) -> Self:
+        """Return the options; TypeError if one is unknown."""
+        check_known(given)
+        return super().__new__(cls)
+
     def __post_init__(self):
         settings = apply_preset(self.preset, vars(self), PRESETS)
         for name in DECLARED:
@@ -617,12 +622,17 @@ def given_options(
     from s4a.seeds import seeded
 
     given = seeded(given)
+    check_known(given, pair=pair)
+    return Options(**given) if of is None else of.changed(given)
+
+
+def check_known(given: Iterable[str], *, pair: bool = False) -> None:
+    """Raise TypeError if a name is not that of an option, or of one of a single `pair`."""
     known = [name for name, one in DECLARED.items() if one.metadata["pair"] or not pair]
-    for name in given.keys() - set(known):
+    for name in set(given) - set(known):
         near = [] if name in DECLARED else difflib.get_close_matches(name, known, 1)
         said = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
         raise TypeError(f"unexpected option {name}{' of a pair' if pair else ''}; {said}")
-    return Options(**given) if of is None else of.changed(given)
 
 
 def _entry(one):

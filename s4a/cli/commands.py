@@ -216,8 +216,11 @@ def view(
     up
         axis that points up
     """
+    tree = s4a.open_study(study)
     file = Path(page) if page else within(study, "study.html")
-    s4a.write_page(s4a.open_study(study), file, title=title or Path(study).name, view=view, up=up)
+    if file.is_dir() or not file.parent.is_dir():
+        raise ValueError(f"--page needs a file in an existing folder; found {page}")
+    s4a.write_page(tree, file, title=title or Path(study).name, view=view, up=up)
     write(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)")
     return 0
 
@@ -513,6 +516,7 @@ def compare(
     landmarks: list[str] | None = None,
     keep: bool = False,
     out: str = "compare",
+    preset: Literal["paper"] | None = None,
     n_pairs: int,
     **options: Any,
 ) -> int:
@@ -537,8 +541,10 @@ def compare(
         also write meshes, matches and maps to compare.nc, for s4a.widgets.Comparison
     out : FOLDER
         folder for compare.nc and compare.png
+    preset
+        the methods and options of the paper
     """
-    options["n_coarse"] = options["n_coarse"] or N_COARSE
+    options |= {"preset": preset, "n_coarse": options["n_coarse"] or N_COARSE}
     if collection:
         if paths or truth or landmarks or keep:
             raise ValueError(
@@ -673,5 +679,5 @@ COMMANDS = {
     "statistics": command(statistics, ("seed",)),
     "insert": command(insert, ("n_jobs", *SYSTEM)),
     "transfer": command(transfer, (*OF_PAIRS, "n_jobs"), unset=True),
-    "compare": command(compare, ("n_coarse", "n_pairs", "k", "preset", "seed")),
+    "compare": command(compare, ("n_coarse", "n_pairs", "k", "seed")),
 }
