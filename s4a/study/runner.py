@@ -27,6 +27,20 @@ from s4a.study.store import LOGS, Claim, open_without_following, task_key, write
 log = logging.getLogger(__name__)
 
 Keys = dict[str, str]  # name of a shape, or file of several -> key of the result
+
+
+def names_and_keys(stage: str, keys: Keys) -> tuple[str, ...]:
+    """Return names and keys of the files of shapes, for files that are made from them.
+
+    Examples
+    --------
+    >>> from s4a.study.runner import names_and_keys
+    >>> names_and_keys("coarse", {"a": "0c1d"})
+    ('coarse/a=0c1d',)
+    """
+    return tuple(f"{stage}/{name}={key}" for name, key in keys.items())
+
+
 LONGEST = len("insert flagged shapes: ")  # longest text before the progress bar
 
 
@@ -46,7 +60,7 @@ class Task:
     inputs : tuple
         Dependencies of the result: keys of other tasks, contents, parameters.
     made_from : tuple of str
-        Keys of files that :func:`s4a.open_study` needs to use this one.
+        Names and keys, ``name=key``, of files that :func:`s4a.open_study` needs to use this one.
 
     Examples
     --------
@@ -296,7 +310,8 @@ def do_task(task: Task, claim: Claim) -> Outcome:
         try:
             with threadpool_limits(1):
                 data = task.function(*task.arguments)
-            write(data, claim.folder / task.file, task.key, task.made_from, claim)
+            name, path = task.file.removesuffix(".nc"), claim.folder / task.file
+            write(data, path, task.key, task.made_from, claim, name=name)
         except OSError:  # of the folder or the disk, not of the shape
             raise
         except (Exception, SystemExit) as error:  # any error stops this task only
