@@ -24,6 +24,8 @@ SUFFIXES[".obj"] = "OBJ"  # and of MNI
 WRITERS = {kind.suffixes.split()[0]: kind.write for kind in FORMATS.values() if kind.write}
 LONGEST_NAME = 100  # characters of a shape's name, as files of a study are named after it
 OTHERS = ".json .csv .txt .md .html .png .jpg .nc .npy .annot .nii".split()  # not meshes
+# grapheme joiner, variation selectors, fillers of Hangul and the blank of Braille
+_UNSEEN = re.compile("[\u034f\ufe00-\ufe0f\u115f\u1160\u3164\uffa0\u2800]")
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -390,6 +392,17 @@ def _plain(text):
 
 def _digest(text):
     return hashlib.sha256(os.fsencode(text)).hexdigest()[:8]
+
+
+def visible(text: str) -> str:
+    """Return a text in composed letters, without characters that cannot be seen."""
+    text = unicodedata.normalize("NFC", text)
+    kept = (
+        c
+        for c in text
+        if c.isspace() or not (unicodedata.category(c) in ("Cf", "Cc") or _UNSEEN.match(c))
+    )
+    return " ".join("".join(kept).split())
 
 
 def check_names(names: Iterable[Any]) -> None:
