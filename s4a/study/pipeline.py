@@ -24,7 +24,7 @@ from s4a.method.remesh import check_wrap
 from s4a.options import Options, given_options
 from s4a.schema import dataset
 from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
-from s4a.study.processes import temporary_folder
+from s4a.study.processes import limited, temporary_folder
 from s4a.study.quality_control import (
     check_plausibility,
     check_registrations,
@@ -187,7 +187,7 @@ def analyse(
     settings.check_against(list(sources))
     marked = find_guides(sources, settings.landmarks, settings.feature_names)
     with lock(store) as claim:
-        run = Run(claim, n_jobs)
+        run = Run(claim, limited(limited(n_jobs), len(sources)))
         if subjects is not None:
             write(with_contents(subjects, sources), run.folder / "subjects.nc", name="subjects")
         else:

@@ -22,7 +22,7 @@ from tqdm.auto import tqdm
 from s4a.study.netcdf import is_done
 from s4a.study.processes import died, interruption_kept, workers
 from s4a.study.progress import Notes, Stage
-from s4a.study.store import LOGS, Claim, open_without_following, task_key, write
+from s4a.study.store import LOCK, LOGS, Claim, open_without_following, task_key, write
 
 log = logging.getLogger(__name__)
 
@@ -284,8 +284,15 @@ class Run:
             with interruption_kept() as self.interrupted:
                 yield
             self.notes.write("finished")
-        except (ValueError, OSError, StageError):
+        except (ValueError, OSError, StageError) as error:
             self.end_if_interrupted()  # the interrupt may be the cause
+            gone = getattr(error, "filename", "") if isinstance(error, FileNotFoundError) else ""
+            if gone or not (self.folder / LOCK).is_file():
+                gone = gone if (self.folder / LOCK).is_file() else self.folder
+                raise OSError(
+                    f"{gone} was removed or replaced during the run: start it again, and keep the "
+                    "folder of the study in its place until the run ends"
+                ) from error
             raise
         except Exception as error:
             self.end_if_interrupted()

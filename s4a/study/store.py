@@ -122,6 +122,8 @@ def write(
     data.attrs |= {"file": name, "task_key": key, "made_from": " ".join(made_from)}
     buffer = io.BytesIO()  # HDF5 crashes the process if the disk is full
     write_netcdf(data, buffer, compression)
+    if claim is not None:
+        claim.check()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:
