@@ -25,7 +25,7 @@ from s4a.method.remesh import check_wrap
 from s4a.options import Options, given_options
 from s4a.schema import dataset
 from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
-from s4a.study.processes import temporary_folder
+from s4a.study.processes import limited, temporary_folder
 from s4a.study.quality_control import (
     check_plausibility,
     check_registrations,
@@ -35,7 +35,7 @@ from s4a.study.quality_control import (
     stop_if_flagged,
 )
 from s4a.study.report import write_report
-from s4a.study.runner import Keys, Run, Task
+from s4a.study.runner import Keys, Run, Task, names_and_keys
 from s4a.study.sources import (
     Collection,
     Marked,
@@ -191,9 +191,9 @@ def analyse(
     settings.check_against(list(sources))
     marked = find_guides(sources, settings.landmarks, settings.feature_names)
     with lock(store) as claim:
-        run = Run(claim, n_jobs)
+        run = Run(claim, limited(limited(n_jobs), len(sources)))
         if subjects is not None:
-            write(with_contents(subjects, sources), run.folder / "subjects.nc")
+            write(with_contents(subjects, sources), run.folder / "subjects.nc", name="subjects")
         else:
             remarks = remarks + remarks_on_table(run.folder / "subjects.nc", sources)
         remarks = remarks + remarks_on_guides(sources, marked, settings.feature_names)
@@ -298,7 +298,7 @@ def choose_reflected(
             mean_chirality=mean_chirality(comparisons) if comparisons else np.zeros(0),
             reflected=np.array([name in reflected for name in comparisons], int),
         )
-        write(choice.assign_coords(shape=list(comparisons)), file, key)
+        write(choice.assign_coords(shape=list(comparisons)), file, key, name="network/chirality")
     choice = read(file)
     remarks = choice.attrs["remarks"].splitlines()
     for remark in remarks:
@@ -314,7 +314,14 @@ def remesh(run: Run, original: Keys, options: Options) -> Keys:
     if options.method != "rematch":
         settings = (*settings, options.method)
     todo = [
-        Task(n, f"coarse/{n}.nc", remesh_shape, (run.folder, n, options), (key, settings), (key,))
+        Task(
+            n,
+            f"coarse/{n}.nc",
+            remesh_shape,
+            (run.folder, n, options),
+            (key, settings),
+            names_and_keys("original", {n: key}),
+        )
         for n, key in original.items()
     ]
     coarse = run.do("remesh and spectrum", todo)
@@ -416,7 +423,8 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
             else []
         )
         for node in [*iterations, "network", "latent"]:
-            write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, coarse.values())
+            made_from = names_and_keys("coarse", coarse)
+            write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, made_from, name=node)
     return key
 
 
@@ -450,7 +458,7 @@ def insert_excluded(
             insert_shape,
             (run.folder, n, options),
             (latent, excluded[n], key, settings),
-            (latent, excluded[n]),
+            (f"latent={latent}", f"coarse/{n}={excluded[n]}"),
         )
         for n, key in aligned.items()
     ]
@@ -466,20 +474,21 @@ def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Optio
     mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
     if inserted:
         mesh.attrs["excluded"] = " ".join(inserted)
-    write(mesh, run.folder / "registration.nc", template_key, [latent])
+    made_from = [f"latent={latent}"]
+    write(mesh, run.folder / "registration.nc", template_key, made_from, name="registration")
     todo = []
     for n, key in sorted(coarse.items()):
         if n in run.failures:
             continue
-        latent_key = (inserted[n],) if n in inserted else ()
+        of_latent = {n: inserted[n]} if n in inserted else {}
         todo.append(
             Task(
                 n,
                 f"registration/{n}.nc",
                 register_shape,
                 (run.folder, n, template, options),
-                (template_key, key, *latent_key),
-                (template_key, *latent_key),
+                (template_key, key, *of_latent.values()),
+                (f"registration={template_key}", *names_and_keys("latent", of_latent)),
             )
         )
     registered = run.do("registration", todo)
@@ -511,5 +520,6 @@ def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> str:
             log.warning("no modes: %s", error)
             (run.folder / "pca.nc").unlink(missing_ok=True)
             return str(error)
-        write(result, run.folder / "pca.nc", task_key(keys), keys)
+        made_from = names_and_keys("registration", registered)
+        write(result, run.folder / "pca.nc", task_key(keys), made_from, name="pca")
     return ""
