@@ -342,6 +342,11 @@ class Options:
     weights: str = network("cycles",
         "weights of the maps: from their cycle errors (cycles), or all 1 (equal)",
         choices=("cycles", "equal"), section="eq. 3", see="method/network")
+    isometric: bool = network(False,
+        "before each iteration of Consistent ZoomOut, replace the two maps of a pair by the more "
+        "orthogonal one and its transpose, as pyFM does", section="4.2", see="method/latent",
+        more="The maps then preserve area, so the energies of eq. 5 are smaller.  In pyFM this is "
+        "``isometric`` of ``FMN.zoomout_refine``, which is True by default")
     n_samples: int = network(N_SAMPLES,
         "number of farthest-point samples that Consistent ZoomOut matches; 0 for all vertices",
         paper=0, fast=500, section="eq. 3", instead="for all vertices in every iteration",
@@ -411,11 +416,14 @@ class Options:
     intersections: bool = quality(True,
         "count self-intersecting triangles: those that intersect others of the same shape")
     quality_control: str = quality("exclude",
-        "suspect (flagged) shapes, such as mirrored ones, are excluded, or the run stops",
-        choices=("exclude", "stop"),
+        "suspect (flagged) shapes, such as mirrored ones, are excluded, the run stops, or "
+        "all shapes are used (off)",
+        choices=("exclude", "stop", "off"), paper="off", section="4.2", instead="all shapes",
+        see="study/quality_control",
         more="A flagged shape, such as a mirrored one or one in another unit, is left out of the "
         "network and of the modes.  It is registered afterwards, with the results of the others "
-        "held fixed.  With 'stop' the run ends before the long stages")
+        "held fixed.  With 'stop' the run ends before the long stages.  With 'off' all shapes are "
+        "in the network and the modes, each can be the median, and findings are warnings")
     include_flagged: bool = quality(False,
         "include suspect (flagged) shapes in the modes and statistics")
     # fmt: on

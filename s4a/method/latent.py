@@ -17,7 +17,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import cKDTree
 
 from s4a.geometry.align import RigidTransform, realign
-from s4a.method.fmap import fmap_from_match
+from s4a.method.fmap import fmap_from_match, orthogonality_error
 from s4a.method.initial_map import initial_map
 from s4a.method.median import area_differences, conformal_differences, distance_to_identity
 from s4a.method.nearest import (
@@ -254,6 +254,36 @@ def latent_basis(
     return Y, np.maximum(latent_eigenvalue, 0.0)
 
 
+def isometric_maps(C: Array, source: Array, target: Array) -> Array:
+    """Replace both maps of each pair by the more orthogonal one and its transpose ``(p, k, k)``.
+
+    The maps of an isometry are orthogonal, and transposes of each other.  This is pyFM's reading of
+    Consistent ZoomOut (``FMN.set_isometries``).
+
+    Parameters
+    ----------
+    C : float ndarray (p, k, k)
+    source, target : int ndarray (p,)
+        Shapes of each map.  A map without a map in the other direction stays as it is.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.latent import isometric_maps
+    >>> isometric_maps(np.array([[[1.0]], [[3.0]]]), np.array([0, 1]), np.array([1, 0])).tolist()
+    [[[1.0]], [[1.0]]]
+    """
+    row = {pair: r for r, pair in enumerate(zip(source.tolist(), target.tolist(), strict=True))}
+    error = [orthogonality_error(c) for c in C]
+    C = C.copy()
+    for (i, j), r in row.items():
+        back = row.get((j, i), r)
+        if r < back:
+            better, worse = (r, back) if error[r] <= error[back] else (back, r)
+            C[worse] = C[better].T
+    return C
+
+
 def latent_size(n_latent: int | None, k: int, k_final: int) -> int:
     """Return the latent dimension at size k: at most k, in proportion to `n_latent` / `k_final`."""
     return k if n_latent is None else min(k, max(1, round(k * n_latent / k_final)))
@@ -269,6 +299,7 @@ def consistent_zoomout(
     step: int = 5,
     n_latent: int | None = None,
     weights: str = "cycles",
+    isometric: bool = False,
     samples: list[Array] | None = None,
     dense_iterations: int = DENSE_ITERATIONS,
     n_jobs: int | None = 1,
@@ -300,6 +331,8 @@ def consistent_zoomout(
         Final latent dimension; k by default.
     weights : {"cycles", "equal"}
         Weights of the maps: by cycle error, or 1 for all.
+    isometric : bool
+        Whether each iteration starts with :func:`isometric_maps`.
     samples : list of int ndarray, optional
         Farthest-point samples of every shape, at least 2 k unless they are all vertices; all
         vertices by default.
@@ -339,6 +372,7 @@ def consistent_zoomout(
     for size, next_size in zip(
         sizes, [*sizes[1:], None], strict=True
     ):  # the last only solves for Y
+        C = isometric_maps(C, source, target) if isometric and next_size else C
         error = cycle_errors(C, cycles, n_jobs=n_jobs)
         weight = cycle_weights(error) if weights == "cycles" else np.ones(len(C))
         m = latent_size(n_latent, size, k)

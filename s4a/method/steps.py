@@ -285,6 +285,7 @@ def refine_network(
     step: int = 5,
     n_latent: int | None = None,
     weights: str = "cycles",
+    isometric: bool = False,
     n_samples: int = N_SAMPLES,
     dense_iterations: int = DENSE_ITERATIONS,
     norm: str = "h2",
@@ -300,7 +301,7 @@ def refine_network(
         Name -> low-resolution mesh with its spectrum.
     initial : xarray.Dataset
         Network of :func:`build_network`.
-    k, step, n_latent, weights, n_samples, dense_iterations, norm, keep_iterations
+    k, step, n_latent, weights, isometric, n_samples, dense_iterations, norm, keep_iterations
         Options of Consistent ZoomOut and of the median shape.  :class:`s4a.Options` describes them.
     n_jobs : int
         Number of threads, as in joblib: -1 for all cores.  The result does not depend on it.
@@ -390,6 +391,7 @@ def refine_network(
             step=step,
             n_latent=n_latent,
             weights=weights,
+            isometric=isometric,
             samples=[basis.sample_vertices_of(n_samples) for basis in bases],
             dense_iterations=dense_iterations,
             n_jobs=n_jobs,

@@ -32,6 +32,7 @@ from s4a.study.quality_control import (
     comparisons_of,
     exclude_flagged,
     stop_if_flagged,
+    unflagged,
 )
 from s4a.study.report import write_report
 from s4a.study.runner import Keys, Run, Task
@@ -222,6 +223,7 @@ def run_steps(
     registered = register(run, coarse | excluded, inserted, latent, options)
     failed, on_registrations = check_registrations(run, registered, inserted)
     flags = {name: [*flags.get(name, []), *failed.get(name, [])] for name in registered}
+    flags = unflagged(flags) if options.quality_control == "off" else flags
     why_no_modes = modes(run, registered, flags, options)
     remarks = [*on_chirality, *on_exclusion, *on_shapes, *on_registrations, *remarks]
     write_report(run, sources, options, remarks, why_no_modes, registered, flags)
@@ -369,6 +371,7 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
     settings = (options.k, options.step, options.n_latent, options.norm)
     iteration_settings = (
         options.weights,
+        options.isometric,
         options.n_samples,
         options.dense_iterations,
         options.keep_iterations,

@@ -172,6 +172,7 @@ def consistent_maps(
         step=options.step,
         n_latent=options.n_latent,
         weights=options.weights,
+        isometric=options.isometric,
         n_samples=options.n_samples,
         dense_iterations=options.dense_iterations,
         norm=options.norm,

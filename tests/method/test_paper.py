@@ -224,8 +224,9 @@ def test_the_smooth_displacement_is_the_projection_as_printed(fixture, request):
         assert stored(study, "displacement", name) == pytest.approx(B @ coefficient, abs=1e-3)
 
 
-def test_consistent_zoomout_is_that_of_pyfm_where_weights_are_equal(paper):
-    """Same subspaces, same matches from the same maps; other weights of pyFM's are by cycles."""
+@pytest.mark.parametrize("isometric", [False, True])
+def test_consistent_zoomout_is_that_of_pyfm_where_weights_are_equal(paper, isometric):
+    """Same subspaces and matches from the same maps, in both readings (pyfmaps 1.3.1)."""
     names = paper["latent"]["shape"].values.tolist()
     bases = [Shape(coarse=paper["coarse"][name].to_dataset()).low for name in names]
     source, target = (
@@ -243,10 +244,10 @@ def test_consistent_zoomout_is_that_of_pyfm_where_weights_are_equal(paper):
     edges = list(zip(source.tolist(), target.tolist(), strict=True))
     other = FMN(meshes, dict(zip(edges, first, strict=True)))
     other.zoomout_refine(
-        nit=2, step=5, subsample=None, isometric=False, weight_type="adjacency", cclb_ratio=1.0
+        nit=2, step=5, subsample=None, isometric=isometric, weight_type="adjacency", cclb_ratio=1.0
     )
     C, _, _, Y, eigenvalue = latent.consistent_zoomout(
-        bases, first, source, target, 20, step=5, weights="equal"
+        bases, first, source, target, 20, step=5, weights="equal", isometric=isometric
     )
     assert np.stack([other.maps[edge] for edge in edges]) == pytest.approx(C, abs=1e-3)
 
