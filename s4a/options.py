@@ -302,7 +302,8 @@ class Options:
         "``refined_eigenfunctions`` and ``wrap`` cannot be used with SCALABLE")
     n_coarse: int = network(N_COARSE, "number of vertices of the low-resolution meshes", least=100,
         fast=3000, section="4.1", of="low resolution", pair=True,
-        more="The meshes have between 95 and 110 % of this number.  With SCALABLE it is the number "
+        more="The meshes have between 95 and 110 % of this number, usually 95 %: 5,700 of 6,000, "
+        "since the rest is for repairs of the topology.  With SCALABLE it is the number "
         "of samples")
     wrap: bool = network(False, "wrap the shapes in a watertight surface before remeshing",
         of="low resolution")
@@ -367,8 +368,9 @@ class Options:
         "detail less weight in the domain and more weight in the image.  "
         ":func:`s4a.method.median.distance_to_identity` has the formulas")
     keep_iterations: bool = network(False,
-        "store the maps and latent bases of every iteration of Consistent ZoomOut",
-        more="They are the nodes of ``/iterations``")
+        "store the maps, latent bases and matches of every iteration of Consistent ZoomOut",
+        pair=True, more="They are the nodes of ``/iterations``.  The descriptors of initial maps "
+        "are in ``/network``.  :func:`s4a.match_pair` returns the iterations of ZoomOut")
     template: str | None = registration(None,
         "name of the shape to register to; by default the median shape")
     dense_match: str = registration("latent",

@@ -305,6 +305,7 @@ def consistent_zoomout(
     n_jobs: int | None = 1,
     progress: Callable[..., Any] | None = None,
     keep: Callable[..., Any] | None = None,
+    keep_matches: Callable[..., Any] | None = None,
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Refine the maps of a network by Consistent ZoomOut (4.2) until all are k x k.
 
@@ -343,7 +344,10 @@ def consistent_zoomout(
     progress : callable, optional
         Called with the current size after each iteration.
     keep : callable, optional
-        Called with C, Y and the latent eigenvalues of each iteration.
+        Called with C, Y, the latent eigenvalues, weights and cycle errors of each iteration.
+    keep_matches : callable, optional
+        Called with the matches of each iteration (eq. 3): for every map the matched coarse vertices
+        of the source, and the coarse vertices of the target.
 
     Returns
     -------
@@ -383,11 +387,17 @@ def consistent_zoomout(
         if progress:
             progress(size)
         if keep:
-            keep(C, Y, latent_eigenvalue)
+            keep(C, Y, latent_eigenvalue, weight, error)
         if next_size:
             del C  # so that maps of only one size are in memory
             dense_bases = bases if size in dense_sizes else None
-            C = _larger_maps(sampled, Y, source, target, next_size, dense_bases, n_jobs)
+            C, match = _larger_maps(sampled, Y, source, target, next_size, dense_bases, n_jobs)
+        elif keep_matches:
+            match = _sample_matches(sampled, Y, source, target, n_jobs)
+        if keep_matches:
+            if size not in dense_sizes:  # matches are between samples
+                match = [sampled[i].vertex[m] for i, m in zip(source, match, strict=True)]
+            keep_matches(match, [sampled[j].vertex for j in target])
     return C, weight, error, Y, latent_eigenvalue
 
 
@@ -403,6 +413,11 @@ class _Sampled(NamedTuple):
     area: Array
     around: Array
     n: int  # vertices of the shape
+
+    @property
+    def vertex(self) -> Array:
+        """The samples, as vertices ``(s,)``."""
+        return self.around[:, 0]
 
 
 def _check_samples(sampled, k):
@@ -428,7 +443,7 @@ def sample(basis: Basis, vertex: Array | None, k: int, n_around: int) -> _Sample
 
 
 def _larger_maps(sampled, Y, source, target, k, bases, n_jobs=1):
-    """Maps ``(p, k, k)`` from matches of the latent functions (eq. 3): one step of ZoomOut.
+    """Maps ``(p, k, k)`` and the matches of the latent functions that they follow from (eq. 3).
 
     Parameters
     ----------
@@ -460,7 +475,7 @@ def _larger_maps(sampled, Y, source, target, k, bases, n_jobs=1):
             solve, query = prepared[target[r]]
             matched = match[r]
             if bases is not None:
-                matched = nearest_around(query, rows, sampled[i].around[matched])
+                match[r] = matched = nearest_around(query, rows, sampled[i].around[matched])
             C[r] = solve @ Phi.take(matched, axis=0)
 
     for begin in range(0, len(sampled), TARGETS):
@@ -468,7 +483,7 @@ def _larger_maps(sampled, Y, source, target, k, bases, n_jobs=1):
         prepared = dict(zip(block, in_threads(solver_and_query, block, n_jobs), strict=True))
         some_maps = np.flatnonzero((target >= begin) & (target < begin + TARGETS))
         in_threads(maps_from, np.unique(source[some_maps]), n_jobs)
-    return C
+    return C, match
 
 
 def _sample_matches(sampled, Y, source, target, n_jobs=1):

@@ -338,7 +338,7 @@ def initial_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys
     names, k_init = list(coarse), spectra.shape[1]
     pairs = choose_pairs(spectral_distance(spectra), options.n_pairs)
     batches = in_batches([[names[i], names[j]] for i, j in pairs])
-    settings = (k_init, options.of("initial maps"))
+    settings = (k_init, options.of("initial maps"), options.keep_iterations)
     files = {f"network/initial_{i:03d}.nc": batch for i, batch in enumerate(batches)}
     todo = [
         Task(f, f, map_pairs, (run.folder, batch, *settings), (aligned, batch, *settings))
