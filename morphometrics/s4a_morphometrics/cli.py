@@ -103,7 +103,7 @@ def growth(
     subject : COLUMN
         subject of each shape
     covariates : COLUMN
-        covariates
+        covariates, separated by spaces or commas
     field : NAME
         name of a field of s4a fields, in place of shape
     of
@@ -159,7 +159,7 @@ def covariation(
     field : FIELD
         name of a field of s4a fields
     covariates : COLUMN
-        covariates
+        covariates, separated by spaces or commas
     table : PATH
         CSV with a column 'shape', in place of the table of the study
     include_flagged

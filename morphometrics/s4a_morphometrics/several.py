@@ -6,7 +6,6 @@ in the frame of its scan, so they are mirrored together.  :mod:`s4a_morphometric
 all structures jointly.
 """
 
-import csv
 import json
 import logging
 import shutil
@@ -20,6 +19,7 @@ import numpy as np
 import xarray as xr
 
 import s4a
+from s4a.input.annotations import write_rows
 from s4a.input.chirality import AUTO, to_reflect
 from s4a.input.collection import remarks_on_files
 from s4a.input.files import check_names, files_named, find_meshes, slug
@@ -177,11 +177,10 @@ def write_inputs(part: Part, folder: Path, name: str) -> dict[str, Any]:
     inputs: dict[str, Any] = {}
     if part.rows:
         inputs["table"] = folder / f"{name}.csv"
-        with inputs["table"].open("w", newline="", encoding="utf-8") as table:
-            columns = list(next(iter(part.rows.values())))
-            lines = csv.writer(table)
-            lines.writerow(["shape", *columns])
-            lines.writerows([shape, *cells.values()] for shape, cells in part.rows.items())
+        head = ["shape", *next(iter(part.rows.values()))]
+        write_rows(
+            inputs["table"], [head, *([name, *cells.values()] for name, cells in part.rows.items())]
+        )
     if part.landmarks:
         inputs["landmarks"] = marks = folder / f"{name}.landmarks"
         shutil.rmtree(marks, ignore_errors=True)

@@ -1,6 +1,5 @@
 """Export of registered collections to other programs (4.3, 6.1, 6.2): meshes and tables."""
 
-import csv
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import xarray as xr
 from s4a.analysis.inputs import registration_of
 from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays
+from s4a.input.annotations import write_rows
 from s4a.input.chirality import MIRROR
 from s4a.input.files import write_mesh
 from s4a.study import store
@@ -20,8 +20,7 @@ FORMATS = {"ply": ".ply", "vtk": ".vtk", "obj": ".obj", "npz": ".npz", "gifti": 
 
 def write_table(path: Path, head: Iterable[Any], rows: Iterable[Any]) -> Path:
     """Write a CSV file and return its path."""
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([list(head), *rows])
+    write_rows(path, [head, *rows])
     return path
 
 

@@ -261,8 +261,7 @@ def statistics(
     if covariates and not (group or regress_on):
         raise ValueError("--covariates needs a test: give --group or --regress-on")
     tree, out = study_to_test(study, out, table, include_flagged)
-    names = [name for word in covariates or () for name in word.split(",") if name] or None
-    options = {"covariates": names, "seed": seed, "variances": variances}
+    options = {"covariates": covariates, "seed": seed, "variances": variances}
     write_statistics(tree, out, group, regress_on, permutations, options)
     return 0
 

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import logging
+import re
 import zipfile
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -25,6 +26,7 @@ _MARKUPS = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/"
     "Resources/Schema/markups-schema-v1.0.3.json#"
 )
+_FORMULA = r"[=+@\t\r-]."  # the beginning of a cell that a spreadsheet evaluates
 RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])  # and back
 
 
@@ -174,7 +176,7 @@ def _colour_table(file):
 def table_rows(text: str) -> dict[int, list[str]]:
     """Split a table at commas, semicolons, tabs or spaces; rows by the number of their last line.
 
-    Empty lines and comments, which begin with ``#``, are skipped.
+    Empty lines and comments, which begin with ``#``, are skipped, as is Excel's ``sep=;``.
 
     Examples
     --------
@@ -185,7 +187,7 @@ def table_rows(text: str) -> dict[int, list[str]]:
     lines = {
         number: line
         for number, line in enumerate(text.splitlines(), 1)
-        if line.strip() and not line.startswith("#")
+        if line.strip() and not re.match("#|sep=.$", line)
     }
     if not lines:
         raise ValueError("the file is empty")
@@ -193,8 +195,33 @@ def table_rows(text: str) -> dict[int, list[str]]:
     mark = next((mark for mark in ",;\t" if mark in texts[0]), " ")
     rows = {}
     for row in (reader := csv.reader(texts, delimiter=mark, skipinitialspace=True)):
-        rows[numbers[reader.line_num - 1]] = [cell.strip() for cell in row]
+        cells = (cell.strip() for cell in row)
+        rows[numbers[reader.line_num - 1]] = [re.sub(f"^'(?={_FORMULA})", "", c) for c in cells]
     return rows
+
+
+def write_rows(path: Path | str, rows: Iterable[Iterable[Any]]) -> None:
+    """Write a CSV file; a text that a spreadsheet would take for a formula gets an apostrophe.
+
+    :func:`table_rows` removes the apostrophe.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from s4a.input.annotations import write_rows
+    >>> path = Path(tempfile.mkdtemp()) / "table.csv"
+    >>> write_rows(path, [["a", "=1+1", "-3.2", -3.2]])
+    >>> path.read_text().strip()
+    "a,'=1+1,-3.2,-3.2"
+    """
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([[_escaped(cell) for cell in row] for row in rows])
+
+
+def _escaped(cell):
+    is_formula = isinstance(cell, str) and re.match(_FORMULA, cell) and not is_number(cell)
+    return f"'{cell}" if is_formula else cell
 
 
 def _check_cells(rows, n, least):
@@ -398,10 +425,7 @@ def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
     if "landmark_curve" in landmarks:
         head += ["curve", "closed"]
         columns += [landmarks["landmark_curve"].values, landmarks["landmark_closed"].values]
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(head)
-        table.writerows(zip(*(column.tolist() for column in columns), strict=True))
+    write_rows(path, [head, *zip(*(column.tolist() for column in columns), strict=True)])
 
 
 def _markups(landmarks):

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import xarray as xr
 
+from s4a.input.columns import check_column
 from s4a.input.subjects import listed
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -275,6 +276,8 @@ def _rows_of(table, column, value):
     if missing:
         raise ValueError(f"reflect: the column {column!r} has no value for {listed(missing)}")
     if value is not None:
+        cells = np.array(list(words.values()))
+        check_column(cells, list(words), f"reflect, column {column!r}", categories=True)
         if value not in words.values():
             raise ValueError(
                 f"reflect: no shape has {value!r} in the column {column!r}, which has "
