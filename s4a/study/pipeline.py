@@ -33,6 +33,7 @@ from s4a.study.quality_control import (
     comparisons_of,
     exclude_flagged,
     stop_if_flagged,
+    unflagged,
 )
 from s4a.study.report import write_report
 from s4a.study.runner import Keys, Run, Task, names_and_keys
@@ -231,6 +232,7 @@ def run_steps(
     registered = register(run, coarse | excluded, inserted, latent, options)
     failed, on_registrations = check_registrations(run, registered, inserted)
     flags = {name: [*flags.get(name, []), *failed.get(name, [])] for name in registered}
+    flags = unflagged(flags) if options.quality_control == "off" else flags
     why_no_modes = modes(run, registered, flags, options)
     remarks = [*on_chirality, *on_exclusion, *on_shapes, *on_registrations, *remarks]
     write_report(run, sources, options, remarks, why_no_modes, registered, flags)
@@ -367,7 +369,7 @@ def initial_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys
     names, k_init = list(coarse), spectra.shape[1]
     pairs = choose_pairs(spectral_distance(spectra), options.n_pairs)
     batches = in_batches([[names[i], names[j]] for i, j in pairs])
-    settings = (k_init, options.of("initial maps"))
+    settings = (k_init, options.of("initial maps"), options.keep_iterations)
     files = {f"network/initial_{i:03d}.nc": batch for i, batch in enumerate(batches)}
     todo = [
         Task(f, f, map_pairs, (run.folder, batch, *settings), (aligned, batch, *settings))
@@ -400,6 +402,7 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
     settings = (options.k, options.step, options.n_latent, options.norm)
     iteration_settings = (
         options.weights,
+        options.isometric,
         options.n_samples,
         options.dense_iterations,
         options.keep_iterations,
