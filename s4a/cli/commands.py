@@ -59,8 +59,20 @@ def doctor(folder: str = ".") -> int:
     return 1 if missing else 0
 
 
+def exit_code(report: "xr.Dataset", fail_on: str, otherwise: int) -> int:
+    """Return 3 if a shape of a report has a status that --fail-on names, or a worse one."""
+    failed = {"none": [], "excluded": ["excluded"], "flagged": ["flagged", "excluded"]}[fail_on]
+    return 3 if report["status"].isin(failed).any() else otherwise
+
+
 def run(
-    paths: list[str], *, out: str, cluster: str | None = None, words: list[str], **options: Any
+    paths: list[str],
+    *,
+    out: str,
+    cluster: str | None = None,
+    fail_on: Literal["none", "excluded", "flagged"] = "none",
+    words: list[str],
+    **options: Any,
 ) -> int:
     """Analyse a folder of meshes: correspondences, median shape, modes of variation.
 
@@ -72,6 +84,8 @@ def run(
         folder of the study; an unfinished one is resumed
     cluster : ADDRESS
         dask scheduler tcp://host:port, or local:N worker processes
+    fail_on
+        end with exit code 3 if shapes were excluded, or if shapes were flagged or excluded
 
     Examples
     --------
@@ -87,7 +101,7 @@ def run(
     lines = [tables.report_table(report), *tables.cost_lines(report)]
     full.write_text("\n".join(lines) + "\n", encoding="utf-8")
     write(tables.run_summary(study, again=again), *tables.place_lines(out, str(full)))
-    return 1 if study["report"].attrs["unforeseen"] else 0
+    return exit_code(report, fail_on, 1 if study["report"].attrs["unforeseen"] else 0)
 
 
 @contextlib.contextmanager
@@ -216,8 +230,11 @@ def view(
     up
         axis that points up
     """
+    tree = s4a.open_study(study)
     file = Path(page) if page else within(study, "study.html")
-    s4a.write_page(s4a.open_study(study), file, title=title or Path(study).name, view=view, up=up)
+    if file.is_dir() or not file.parent.is_dir():
+        raise ValueError(f"--page needs a file in an existing folder; found {page}")
+    s4a.write_page(tree, file, title=title or Path(study).name, view=view, up=up)
     write(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)")
     return 0
 
@@ -348,6 +365,7 @@ def insert(
     out: str,
     landmarks: str | None = None,
     reflect: str | None = None,
+    fail_on: Literal["none", "excluded", "flagged"] = "none",
     n_jobs: int,
     **system: Any,
 ) -> int:
@@ -365,6 +383,8 @@ def insert(
         folder of landmark files named as the shapes, which guide registration
     reflect : NAMES
         new shapes to mirror: names separated by commas; or auto, those mirrored to the study
+    fail_on
+        end with exit code 3 if shapes were excluded, or if shapes were flagged or excluded
     """
     tree = s4a.open_study(study)
     given = {"landmarks": landmarks, "reflect": reflect, "n_jobs": n_jobs} | system
@@ -374,7 +394,8 @@ def insert(
     s4a.write_registered(inserted, folder)
     write(tables.inserted_table(inserted), "")
     write(f"written: {path}, registered meshes and scores in {folder}")
-    return 1 if (inserted["report"]["status"] == "excluded").any() else 0
+    report = inserted["report"].to_dataset()
+    return exit_code(report, fail_on, 1 if (report["status"] == "excluded").any() else 0)
 
 
 def transfer(
@@ -515,6 +536,7 @@ def compare(
     landmarks: list[str] | None = None,
     keep: bool = False,
     out: str = "compare",
+    preset: Literal["paper"] | None = None,
     n_pairs: int,
     **options: Any,
 ) -> int:
@@ -539,8 +561,10 @@ def compare(
         also write meshes, matches and maps to compare.nc, for s4a.widgets.Comparison
     out : FOLDER
         folder for compare.nc and compare.png
+    preset
+        the methods and options of the paper
     """
-    options["n_coarse"] = options["n_coarse"] or N_COARSE
+    options |= {"preset": preset, "n_coarse": options["n_coarse"] or N_COARSE}
     if collection:
         if paths or truth or landmarks or keep:
             raise ValueError(
@@ -673,5 +697,5 @@ COMMANDS = {
     "statistics": command(statistics, ("seed",)),
     "insert": command(insert, ("n_jobs", *SYSTEM)),
     "transfer": command(transfer, (*OF_PAIRS, "n_jobs"), unset=True),
-    "compare": command(compare, ("n_coarse", "n_pairs", "k", "preset", "seed")),
+    "compare": command(compare, ("n_coarse", "n_pairs", "k", "seed")),
 }

@@ -17,6 +17,9 @@ from s4a.input.subjects import listed
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
 COMMON_SIDE, OTHER_SIDE = 0.8, 0.5  # least |mean chirality|: median of all shapes, of one shape
+# largest ICP residual of a mirror image, as a share of that of the shape: 0.7 to 0.8 for femurs of
+# the other side, 0.88 or more for nearly symmetric faces with meshes of their own
+CLEARLY = 0.85
 AUTO = "auto"
 PLURAL = ("they are", "them", "all that are")
 YES, NO = ("1", "1.0", "true", "yes"), ("0", "0.0", "false", "no")
@@ -118,6 +121,44 @@ def _mean(chirality):
     return np.where(is_known, chirality, 0).sum(1) / np.maximum(is_known.sum(1), 1)
 
 
+def fits_mirrored(
+    comparisons: Mapping[str, xr.Dataset], mirrored: Sequence[str]
+) -> dict[str, tuple[float, float]]:
+    """Median ICP residuals of `mirrored` shapes to references of the common side.
+
+    Returns
+    -------
+    dict of str to tuple (fit, fit_mirrored)
+        Residuals of the shape as it is and reflected.  Only if the latter is below ``CLEARLY``
+        times the former is the side clear: symmetric shapes differ from their mirror images by less
+        than two meshes of one shape do.
+    """
+    fits = {}
+    for name in mirrored:
+        data = comparisons[name]
+        common = ~np.isin(data["reference"].values, mirrored)
+        common |= not common.any()
+        fit, fit_mirrored = (
+            float(np.nanmedian(data[key].values[common])) for key in ("fit", "fit_mirrored")
+        )
+        fits[name] = fit, fit_mirrored
+    return fits
+
+
+def clearly_mirrored(comparisons: Mapping[str, xr.Dataset], names: Sequence[str]) -> list[str]:
+    """Return those of the `names` that fit the common side clearly better if they are reflected."""
+    fits = fits_mirrored(comparisons, names)
+    return [name for name in names if fits[name][1] < CLEARLY * fits[name][0]]
+
+
+def _unclear(weak):
+    they, them, which = ("it is", "it", "it if it is") if len(weak) == 1 else PLURAL
+    return (
+        f"reflect='auto' cannot determine the side of {listed(weak, most=20)}, left as {they}: "
+        f"look at {them}, and name {which} to be mirrored"
+    )
+
+
 def mirrored_shapes(comparisons: Mapping[str, xr.Dataset]) -> tuple[list[str], list[str]]:
     """Return the shapes that ``reflect="auto"`` mirrors, those of the less common side.
 
@@ -130,7 +171,12 @@ def mirrored_shapes(comparisons: Mapping[str, xr.Dataset]) -> tuple[list[str], l
     """
     if len(comparisons) < 2:
         return [], ["reflect='auto' needs at least two shapes to compare"]
-    return rarer_side(dict(zip(comparisons, mean_chirality(comparisons).tolist(), strict=True)))
+    names, remarks = rarer_side(
+        dict(zip(comparisons, mean_chirality(comparisons).tolist(), strict=True))
+    )
+    clear = clearly_mirrored(comparisons, names)
+    unclear = [name for name in names if name not in clear]
+    return clear, [*remarks, *([_unclear(unclear)] if unclear else [])]
 
 
 def rarer_side(chirality: Mapping[str, float]) -> tuple[list[str], list[str]]:
@@ -143,13 +189,8 @@ def rarer_side(chirality: Mapping[str, float]) -> tuple[list[str], list[str]]:
             "to mirror"
         ]
     weak = [name for name, value in chirality.items() if abs(value) < OTHER_SIDE]
-    they, them, which = ("it is", "it", "it if it is") if len(weak) == 1 else PLURAL
-    remark = (
-        f"reflect='auto' cannot determine the side of {listed(weak, most=20)}, left as {they}: "
-        f"look at {them}, and name {which} to be mirrored"
-    )
     mirrored = [name for name, value in chirality.items() if value <= -OTHER_SIDE]
-    return mirrored, [remark] * bool(weak)
+    return mirrored, [_unclear(weak)] * bool(weak)
 
 
 def is_mirrored(
@@ -173,11 +214,9 @@ def is_mirrored(
             f"distinguish left and right (median |mean_chirality| {median:.2f}, {COMMON_SIDE} "
             "needed)"
         )
-    if abs(this) < OTHER_SIDE:
-        return False, (
-            f"reflect='auto' cannot determine the side of {name}, left as it is: look at it, "
-            "and name it if it is to be mirrored"
-        )
+    is_clear = this > 0 or clearly_mirrored({name: comparison}, [name])
+    if abs(this) < OTHER_SIDE or not is_clear:
+        return False, _unclear([name])
     return bool(this <= -OTHER_SIDE), ""
 
 

@@ -24,7 +24,7 @@ from s4a.method.remesh import check_wrap
 from s4a.options import Options, given_options
 from s4a.schema import dataset
 from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
-from s4a.study.processes import temporary_folder
+from s4a.study.processes import limited, temporary_folder
 from s4a.study.quality_control import (
     check_plausibility,
     check_registrations,
@@ -32,9 +32,10 @@ from s4a.study.quality_control import (
     comparisons_of,
     exclude_flagged,
     stop_if_flagged,
+    unflagged,
 )
 from s4a.study.report import write_report
-from s4a.study.runner import Keys, Run, Task
+from s4a.study.runner import Keys, Run, Task, names_and_keys
 from s4a.study.sources import (
     Collection,
     Marked,
@@ -189,9 +190,9 @@ def analyse(
     settings.check_against(list(sources))
     marked = find_guides(sources, settings.landmarks, settings.feature_names)
     with lock(store) as claim:
-        run = Run(claim, n_jobs, system)
+        run = Run(claim, limited(limited(n_jobs), len(sources)), system)
         if subjects is not None:
-            write(with_contents(subjects, sources), run.folder / "subjects.nc")
+            write(with_contents(subjects, sources), run.folder / "subjects.nc", name="subjects")
         else:
             remarks = remarks + remarks_on_table(run.folder / "subjects.nc", sources)
         remarks = remarks + remarks_on_guides(sources, marked, settings.feature_names)
@@ -224,6 +225,7 @@ def run_steps(
     registered = register(run, coarse | excluded, inserted, latent, options)
     failed, on_registrations = check_registrations(run, registered, inserted)
     flags = {name: [*flags.get(name, []), *failed.get(name, [])] for name in registered}
+    flags = unflagged(flags) if options.quality_control == "off" else flags
     why_no_modes = modes(run, registered, flags, options)
     remarks = [*on_chirality, *on_exclusion, *on_shapes, *on_registrations, *remarks]
     write_report(run, sources, options, remarks, why_no_modes, registered, flags)
@@ -277,7 +279,7 @@ def choose_reflected(
             mean_chirality=mean_chirality(comparisons) if comparisons else np.zeros(0),
             reflected=np.array([name in reflected for name in comparisons], int),
         )
-        write(choice.assign_coords(shape=list(comparisons)), file, key)
+        write(choice.assign_coords(shape=list(comparisons)), file, key, name="network/chirality")
     choice = read(file)
     remarks = choice.attrs["remarks"].splitlines()
     for remark in remarks:
@@ -293,7 +295,14 @@ def remesh(run: Run, original: Keys, options: Options) -> Keys:
     if options.method != "rematch":
         settings = (*settings, options.method)
     todo = [
-        Task(n, f"coarse/{n}.nc", remesh_shape, (run.folder, n, options), (key, settings), (key,))
+        Task(
+            n,
+            f"coarse/{n}.nc",
+            remesh_shape,
+            (run.folder, n, options),
+            (key, settings),
+            names_and_keys("original", {n: key}),
+        )
         for n, key in original.items()
     ]
     coarse = run.do("remesh and spectrum", todo)
@@ -339,7 +348,7 @@ def initial_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys
     names, k_init = list(coarse), spectra.shape[1]
     pairs = choose_pairs(spectral_distance(spectra), options.n_pairs)
     batches = in_batches([[names[i], names[j]] for i, j in pairs])
-    settings = (k_init, options.of("initial maps"))
+    settings = (k_init, options.of("initial maps"), options.keep_iterations)
     files = {f"network/initial_{i:03d}.nc": batch for i, batch in enumerate(batches)}
     todo = [
         Task(f, f, map_pairs, (run.folder, batch, *settings), (aligned, batch, *settings))
@@ -372,6 +381,7 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
     settings = (options.k, options.step, options.n_latent, options.norm)
     iteration_settings = (
         options.weights,
+        options.isometric,
         options.n_samples,
         options.dense_iterations,
         options.keep_iterations,
@@ -395,7 +405,8 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
             else []
         )
         for node in [*iterations, "network", "latent"]:
-            write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, coarse.values())
+            made_from = names_and_keys("coarse", coarse)
+            write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, made_from, name=node)
     return key
 
 
@@ -429,7 +440,7 @@ def insert_excluded(
             insert_shape,
             (run.folder, n, options),
             (latent, excluded[n], key, settings),
-            (latent, excluded[n]),
+            (f"latent={latent}", f"coarse/{n}={excluded[n]}"),
         )
         for n, key in aligned.items()
     ]
@@ -445,20 +456,21 @@ def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Optio
     mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
     if inserted:
         mesh.attrs["excluded"] = " ".join(inserted)
-    write(mesh, run.folder / "registration.nc", template_key, [latent])
+    made_from = [f"latent={latent}"]
+    write(mesh, run.folder / "registration.nc", template_key, made_from, name="registration")
     todo = []
     for n, key in sorted(coarse.items()):
         if n in run.failures:
             continue
-        latent_key = (inserted[n],) if n in inserted else ()
+        of_latent = {n: inserted[n]} if n in inserted else {}
         todo.append(
             Task(
                 n,
                 f"registration/{n}.nc",
                 register_shape,
                 (run.folder, n, template, options),
-                (template_key, key, *latent_key),
-                (template_key, *latent_key),
+                (template_key, key, *of_latent.values()),
+                (f"registration={template_key}", *names_and_keys("latent", of_latent)),
             )
         )
     registered = run.do("registration", todo)
@@ -490,5 +502,6 @@ def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> str:
             log.warning("no modes: %s", error)
             (run.folder / "pca.nc").unlink(missing_ok=True)
             return str(error)
-        write(result, run.folder / "pca.nc", task_key(keys), keys)
+        made_from = names_and_keys("registration", registered)
+        write(result, run.folder / "pca.nc", task_key(keys), made_from, name="pca")
     return ""

@@ -21,8 +21,9 @@ from s4a.input.collection import read_shape
 from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.landmarks import guides_of, with_landmarks
 from s4a.method import steps
-from s4a.method.initial_map import transform_onto
+from s4a.method.initial_map import alignment_residual, transform_onto
 from s4a.method.latent import out_of_sample_latent
+from s4a.method.network import spectral_distance
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.shape import Shape, features_of
 from s4a.options import Options
@@ -146,18 +147,25 @@ def template_of(folder: Path, name: str, options: Options) -> Shape:
 
 def align_shape(folder: Path, name: str, reference: str) -> xr.Dataset:
     """Compute the rigid transform of a shape onto the reference, of unit area (4.1, step 2)."""
-    R, t = np.eye(3), np.zeros(3)
+    R, t, residual = np.eye(3), np.zeros(3), 0.0
     if name != reference:
-        R, t = transform_onto(*(steps.basis_in(Folder(folder), n) for n in (name, reference)))
-    return dataset({"reference": reference}, rotation=R, translation=t)
+        M, N = (steps.basis_in(Folder(folder), n) for n in (name, reference))
+        R, t = transform_onto(M, N)
+        residual = alignment_residual(M, N, (R, t))
+    attrs: dict[str, Any] = {"reference": reference, "residual": residual}
+    return dataset(attrs, rotation=R, translation=t)
 
 
-def map_pairs(folder: Path, pairs: list[Any], k_init: int, options: dict[str, Any]) -> xr.Dataset:
+def map_pairs(
+    folder: Path, pairs: list[Any], k_init: int, options: dict[str, Any], keep: bool
+) -> xr.Dataset:
     """Compute initial maps of some pairs, in both directions (4.1, steps 3 and 4)."""
     study, names = Folder(folder), sorted({name for pair in pairs for name in pair})
     bases = {name: steps.basis_in(study, name) for name in names}
     transforms = {name: steps.transform_in(study, name) for name in names}
-    return steps.map_pairs(bases, transforms, pairs, k_init=k_init, **options)
+    return steps.map_pairs(
+        bases, transforms, pairs, k_init=k_init, keep_descriptors=keep, **options
+    )
 
 
 def consistent_maps(
@@ -166,10 +174,12 @@ def consistent_maps(
     """Refine the network by Consistent ZoomOut (4.2): ``/network`` and ``/latent``."""
     study = Folder(run.folder)
     transforms = {name: steps.transform_in(study, name) for name in names}
-    reference = study[f"network/alignment_{names[0]}"].attrs["reference"]
-    initial = steps.with_transforms(initial, transforms, reference)
+    alignments = [study[f"network/alignment_{name}"].attrs for name in names]
+    reference, residuals = alignments[0]["reference"], [a["residual"] for a in alignments]
     coarse = {name: study[f"coarse/{name}"] for name in names}
     k_init = initial.sizes["eigenpair_source_initial"]
+    distance = spectral_distance([c["eigenvalue"].values[:k_init] for c in coarse.values()])
+    initial = steps.with_transforms(initial, transforms, reference, residuals, distance)
     k = min(options.k, *(mesh.sizes["eigenpair"] for mesh in coarse.values()))
     bar = run.show("consistent ZoomOut", k - k_init)
     return steps.refine_network(
@@ -179,6 +189,7 @@ def consistent_maps(
         step=options.step,
         n_latent=options.n_latent,
         weights=options.weights,
+        isometric=options.isometric,
         n_samples=options.n_samples,
         dense_iterations=options.dense_iterations,
         norm=options.norm,
