@@ -184,6 +184,24 @@ def test_a_collection_is_converted_or_told_what_is_missing():
         s4a.analyse(meshes, unit="inch")
 
 
+def test_a_study_of_files_in_two_systems_is_that_of_files_in_one(tmp_path):
+    brains = s4a.synthetic.brains(3, 200)["original"]
+    options = {"n_coarse": 100, "k": 10, "k_init": 6, "intersections": False}
+    score, remarks = [], []
+    for folder, texts in {"one": ["RAS"] * 3, "two": ["RAS", "RAS", "LPS"]}.items():
+        (tmp_path / folder).mkdir()
+        for (name, mesh), text in zip(brains.items(), texts, strict=True):
+            Y = mesh["position"].values * ([-1, -1, 1] if text == "LPS" else 1)
+            faces = mesh["corner_vertex"].values
+            write_mesh(tmp_path / folder / f"{name}.vtk", Y, faces, coordinate_system=text)
+        study = s4a.analyse(tmp_path / folder, **options)
+        score.append(study["pca/score"].values)
+        remarks.append(study["report"].attrs["remarks"])
+    assert score[0] == pytest.approx(score[1], abs=1e-9)
+    assert "1 of 3 shapes were converted to RAS: brain_03 (LPS)" in remarks[1]
+    assert "converted" not in remarks[0]
+
+
 def test_landmarks_lie_on_the_surface_whatever_the_two_files_say(tmp_path):
     def marks(text, points, unit="mm"):
         return dataset(system(text, unit).attrs, landmark_name=list("abcd"),
