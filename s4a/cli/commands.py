@@ -422,7 +422,7 @@ def transfer(
         labels of the source's vertices: NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer
         annot, also .gz
     source_landmarks : FILE
-        landmarks and curves of the source: Slicer .mrk.json, CSV or MeshLab .pp
+        landmarks and curves of the source: Slicer .mrk.json or .fcsv, CSV, TPS, .pts or MeshLab .pp
     out : FOLDER
         folder for <target>.labels.npy, .confidence.npy, .landmarks.csv
     blur : X
@@ -556,7 +556,7 @@ def compare(
         source vertex (from 0; -1 for none), or its x, y, z
     landmarks : PATH
         landmark files of the source and of each target, whose common names guide registration:
-        Slicer .mrk.json, CSV or MeshLab .pp
+        Slicer .mrk.json or .fcsv, CSV, TPS, .pts or MeshLab .pp
     keep
         also write meshes, matches and maps to compare.nc, for s4a.widgets.Comparison
     out : FOLDER
