@@ -123,7 +123,9 @@ def write_registered(
             points = moved(image_in_shape(X, registered), M)
             triangles = turned(T, M)
         has_scalars = format != "obj" and "confidence" in registered
-        scalars = {"confidence": registered["confidence"].values} if has_scalars else {}
+        scalars: dict[str, Any] = {}
+        if has_scalars:
+            scalars["confidence"] = registered["confidence"].values
         paths.append(folder / f"{name}{suffix}")
         write_mesh(paths[-1], points, triangles, **system.attrs, **scalars)
     paths.append(folder / f"template{suffix}")

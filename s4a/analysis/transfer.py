@@ -32,6 +32,7 @@ from s4a.geometry.closest import (
 )
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas, vertex_normals
 from s4a.input.collection import Mesh, as_meshes
+from s4a.input.coordinates import CoordinateSystem
 from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, as_landmarks, locate, trace_curves
 from s4a.method.register import identity, uncertainty
 from s4a.method.remesh import laplacian
@@ -724,7 +725,8 @@ def transfer_landmarks(
     named = marked[[name for name in NAMED if name in marked]]
     transferred = {}
     for name, target, routes in routes_to_targets:
-        transferred[name] = _transfer_landmarks(marked, target, routes).merge(named)
+        landmarks = _transfer_landmarks(marked, target, routes).merge(named)
+        transferred[name] = landmarks.assign_attrs(CoordinateSystem.of(target.attrs).attrs)
     return xr.DataTree.from_dict(transferred)
 
 

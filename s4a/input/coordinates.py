@@ -129,9 +129,9 @@ class CoordinateSystem:
 
         Axes and unit are those of the system, unless others are given and the system is known.
         """
-        place = {"origin": "scanner", "to_scanner": None} if self.to_scanner else {}
         axes, unit = self.axes and (axes or self.axes), self.unit and (unit or self.unit)
-        return replace(self, axes=axes, unit=unit, **place)
+        place = "scanner" if self.to_scanner else self.origin
+        return replace(self, axes=axes, origin=place, unit=unit, to_scanner=None)
 
 
 def transform(
@@ -227,7 +227,7 @@ def turned(T: np.ndarray, M: np.ndarray) -> np.ndarray:
 
 def transformed(mesh: xr.Dataset, M: np.ndarray) -> xr.Dataset:
     """Apply an affine map (4, 4) to a mesh and its landmarks; normals stay outward."""
-    apply = {f"{name}position": moved for name in ("", "landmark_", "guide_")}
+    apply: dict[str, Any] = {f"{name}position": moved for name in ("", "landmark_", "guide_")}
     apply |= dict.fromkeys(("corner_vertex", "landmark_barycentric", "guide_barycentric"), turned)
     found = {name: mesh[name] for name in apply if name in mesh}
     return mesh.assign({n: v.copy(data=apply[n](v.values, M)) for n, v in found.items()})
@@ -260,7 +260,8 @@ def in_axes(mesh: xr.Dataset, target: CoordinateSystem, what: str = "a mesh") ->
     M = map_between(system, new, what)
     image = transformed(mesh, M)
     reasons = filter(None, [mesh.attrs.get("reason"), f"converted from {system} to {new}"])
-    image.attrs |= {f"file_{name}": text for name, text in system.attrs.items()} | new.attrs
+    file = file_system(mesh.attrs).attrs
+    image.attrs |= {f"file_{name}": text for name, text in file.items()} | new.attrs
     image.attrs["reason"] = "; ".join(reasons)
     if "area" in mesh.attrs:
         image.attrs["area"] *= abs(np.linalg.det(M)) ** (2 / 3)
@@ -301,6 +302,7 @@ def system_in(data: bytes, kind: str) -> CoordinateSystem:
         axes = field[1].decode() if field else ""
     if kind == "VTP" and not space and b"SPACE" in data:
         axes = next(iter(VtkXml(data).strings("SPACE")), "")
+    axes = axes if axes in AXES else ""
     origin = UNKNOWN if b" ORIGIN=unknown" in head else ""
     default = "mm" if axes and (not space or b"Slicer" in head) else ""
     return CoordinateSystem(axes, origin, unit[1].decode() if unit else default)

@@ -175,7 +175,7 @@ def write_mesh(
     *,
     coordinate_system: str = "",
     unit: str = "",
-    **vertex_scalars: np.ndarray,
+    **vertex_scalars: Any,
 ) -> None:
     """Write a mesh file in the format of its suffix.
 

@@ -27,7 +27,6 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
-from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -283,7 +282,7 @@ class VtkXml:
         self.size_type = np.dtype(self.order + ("u8" if is_64_bit else "u4"))
         self.compressor = self.root.get("compressor")
 
-    def values(self, node: Element) -> np.ndarray:
+    def values(self, node: Any) -> np.ndarray:
         """Read the numbers of a DataArray."""
         return self._bytes(node, _number_type(node.get("type"), self.order))
 

@@ -130,15 +130,14 @@ def possible_maps(landmarks: CoordinateSystem, mesh: xr.Dataset) -> dict[str, np
         found = {"a common origin": transform(L, S, origin=False)}
     else:
         found = {GIVEN: transform(CoordinateSystem(unit=L.unit), CoordinateSystem(unit=S.unit))}
-    guesses = {text: CoordinateSystem(text, "", unit) for text in ("RAS", "LPS")}
-    if S.axes and not L.axes:
-        guesses = {f"landmarks in {text}": (guess, S) for text, guess in guesses.items()}
-        guesses["the coordinates of the file"] = file_system(mesh.attrs), S
-    elif L.axes and not S.axes:
-        guesses = {f"a mesh in {text}": (L, guess) for text, guess in guesses.items()}
-    else:
-        guesses = {}
-    found |= {name: transform(*pair) for name, pair in guesses.items()}
+    for text in ("RAS", "LPS"):
+        guess = CoordinateSystem(text, "", unit)
+        if S.axes and not L.axes:
+            found[f"landmarks in {text}"] = transform(guess, S)
+        elif L.axes and not S.axes:
+            found[f"a mesh in {text}"] = transform(L, guess)
+    if not L.axes:
+        found["the coordinates of the file"] = transform(file_system(mesh.attrs), S)
     return {name: M for name, M in found.items() if M is not None} or {GIVEN: np.eye(4)}
 
 

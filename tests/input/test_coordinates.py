@@ -11,7 +11,7 @@ from nibabel.gifti import GiftiCoordSystem, GiftiDataArray, GiftiImage, GiftiMet
 import s4a
 from s4a import read_mesh, read_shapes, write_mesh
 from s4a.geometry.mesh import as_arrays, as_dataset, volume
-from s4a.input.annotations import read_landmarks
+from s4a.input.annotations import read_landmarks, write_landmarks
 from s4a.input.chirality import in_file
 from s4a.input.coordinates import CoordinateSystem, common, in_one_system, transform
 from s4a.input.formats import vtk_bytes, vtp_bytes
@@ -285,6 +285,19 @@ def test_a_written_mesh_lies_where_the_scan_has_it(tmp_path):
             assert volume(scan, S) == pytest.approx(volume(X, T), rel=1e-5), (text, end)
         image = nib.load(tmp_path / "a.gii")
         assert image.agg_data("pointset") == pytest.approx(X, abs=1e-4)
+
+
+def test_written_markups_lie_where_the_scan_has_them(tmp_path):
+    for text, unit, factor in (("surface RAS, c_ras 12 -20 35", "mm", 1), ("PIR", "m", 0.001)):
+        own = system(text, unit)
+        M = transform(system("scanner RAS"), own)
+        given = X[:3] @ M[:3, :3].T + M[:3, 3]
+        marks = dataset(own.attrs, landmark_name=list("abc"), landmark_position=given)
+        write_landmarks(tmp_path / "a.mrk.json", marks)
+        found = read_landmarks(tmp_path / "a.mrk.json")
+        assert found.attrs == system("RAS").attrs
+        assert found["landmark_position"].values == pytest.approx(X[:3])
+        assert np.linalg.det(M[:3, :3]) == pytest.approx(factor**3)
 
 
 def test_messages_end_at_the_end_of_a_sentence():
