@@ -1,7 +1,7 @@
 """Coordinate systems of files (5.1, the data): read, compare and convert.
 
 A system has axes, an origin and a unit.  It is stored as the attributes ``coordinate_system``, a
-text such as those of :data:`EXAMPLES`, and ``unit``.  Everything that combines files asks
+text such as those in :data:`EXAMPLES`, and ``unit``.  Everything that combines files asks
 :func:`transform`, which is None if what is needed is unknown.
 """
 
@@ -19,13 +19,10 @@ from s4a.input.raw import xml
 from s4a.options import MILLIMETRES
 from s4a.schema import in_unit
 
+# RAS and LPS: world coordinates of an image, as 3D Slicer and most programs use them; surface RAS:
+# FreeSurfer's, adding c_ras gives scanner RAS; any other word is the name of a template space
 EXAMPLES = (
-    "RAS",  # world coordinates of an image, as 3D Slicer and most programs use them
-    "LPS",
-    "scanner RAS",
-    "surface RAS, c_ras 1.5 -20 35",  # FreeSurfer's; adding c_ras gives scanner RAS
-    "MNI152 RAS",  # any other word is the name of a template space
-    "RAS, origin unknown",
+    "RAS, LPS, scanner RAS, 'surface RAS, c_ras 1.5 -20 35', MNI152 RAS, 'RAS, origin unknown'"
 )
 AXES = {"".join(axes) for one in product("RL", "AP", "SI") for axes in permutations(one)}
 TEXT = re.compile(
@@ -73,10 +70,11 @@ class CoordinateSystem:
 
         Examples
         --------
-        >>> from s4a.input.coordinates import EXAMPLES, CoordinateSystem
-        >>> systems = [CoordinateSystem.of({"coordinate_system": text}) for text in EXAMPLES]
-        >>> [system.attrs["coordinate_system"] for system in systems] == list(EXAMPLES)
-        True
+        >>> from s4a.input.coordinates import CoordinateSystem
+        >>> text = "surface RAS, c_ras 1.5 -20 35"
+        >>> system = CoordinateSystem.of({"coordinate_system": text, "unit": "mm"})
+        >>> system.axes, system.origin, str(system)
+        ('RAS', 'surface', 'surface RAS, c_ras 1.5 -20 35, mm')
         """
         text, unit = (str(attrs.get(prefix + key) or "") for key in ("coordinate_system", "unit"))
         if not text:
@@ -87,8 +85,7 @@ class CoordinateSystem:
         M = np.column_stack([np.eye(3), M]) if len(numbers) == 3 else M
         fits = len(numbers) in (0, 3, 12) and abs(np.linalg.det(M[:, :3])) > 1e-9
         if not words or words[2] not in AXES or not fits:
-            examples = "; ".join(EXAMPLES)
-            raise ValueError(f"a coordinate system such as {examples} needed, found {text!r}")
+            raise ValueError(f"one coordinate system of {EXAMPLES} needed, found {text!r}")
         to_scanner = tuple(M.ravel().tolist()) if numbers else None
         return cls(words[2], UNKNOWN if words[4] else words[1] or "", unit, to_scanner)
 
@@ -292,7 +289,7 @@ def system_in(data: bytes, kind: str) -> CoordinateSystem:
         return _of_gifti(data)
     if kind == "MNI":
         return CoordinateSystem("RAS", "", "mm")
-    # 3D Slicer writes this into the title or a comment of any file, and into fields of VTK files
+    # 3D Slicer, whose unit is mm, writes SPACE into a title or comment, or into fields of VTK files
     head = data[:1000]
     space = re.search(rb"SPACE=([RLAPSI]{3})\b", head)
     unit = re.search(rb"UNIT=(um|mm|cm|m|in)\b", head)
@@ -304,7 +301,7 @@ def system_in(data: bytes, kind: str) -> CoordinateSystem:
         axes = next(iter(VtkXml(data).strings("SPACE")), "")
     axes = axes if axes in AXES else ""
     origin = UNKNOWN if b" ORIGIN=unknown" in head else ""
-    default = "mm" if axes and (not space or b"Slicer" in head) else ""
+    default = "mm" if axes and b"S4A SPACE" not in head else ""
     return CoordinateSystem(axes, origin, unit[1].decode() if unit else default)
 
 

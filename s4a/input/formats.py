@@ -300,13 +300,9 @@ class VtkXml:
 
     def strings(self, name: str) -> list[str]:
         """Strings of an array in the field data of the file, which are zero-terminated."""
-        nodes = [node for node in self.root.iter() if node.get("Name") == name]
-        return [
-            text.decode("latin-1")
-            for node in nodes
-            if node.get("type") == "String"
-            for text in self._bytes(node, np.dtype("u1")).tobytes().split(b"\0")
-        ]
+        nodes = self.root.iterfind(f".//*[@Name='{name}'][@type='String']")
+        texts = [self._bytes(node, np.dtype("u1")).tobytes() for node in nodes]
+        return [one.decode("latin-1") for text in texts for one in text.split(b"\0")]
 
     def _unpack(self, data, is_base64):
         """Bytes of one array: sizes come first, then the array or its compressed blocks."""

@@ -150,7 +150,7 @@ def test_what_is_unknown_is_not_converted():
     assert transform(system("MNI152 RAS"), system("LPS")) is not None  # of Slicer: any image
     filled = [system(text, unit).filled(system("scanner RAS")) for text, unit in unknown[:4]]
     assert {str(one) for one in filled} == {"scanner RAS, mm", "RAS, mm"}
-    with pytest.raises(ValueError, match=r"such as RAS; .* needed, found 'RAR'"):
+    with pytest.raises(ValueError, match=r"one coordinate system of RAS, .* needed, found 'RAR'"):
         system("RAR")
 
 
