@@ -400,7 +400,14 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
         )
         for node in [*iterations, "network", "latent"]:
             made_from = names_and_keys("coarse", coarse)
-            write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, made_from, name=node)
+            write(
+                tree[node].to_dataset(),
+                run.folder / f"{node}.nc",
+                key,
+                made_from,
+                run.claim,
+                name=node,
+            )
     return key
 
 
