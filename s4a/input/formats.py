@@ -369,13 +369,10 @@ _MAGICS = {
     "a MATLAB file": rb"MATLAB \d",
     "a glTF file": rb"glTF|\s*\{.*\"asset\"\s*:",
     "a DICOM file": rb".{128}DICM",
-    "a MetaImage volume": rb"ObjectType\s*=",
-    "an FBX file": rb"Kaydara FBX",
-    "a Blender file": rb"BLENDER",
-    "a Gmsh file": rb"\$MeshFormat",
-    "a STEP file": rb"ISO-10303",
+    "a MetaImage or MRtrix volume": rb"ObjectType\s*=|mrtrix image",
+    "an FBX, Blender, Gmsh or STEP file": rb"Kaydara FBX|BLENDER|\$MeshFormat|ISO-10303",
     "a streamlines file": rb"TRACK\0|mrtrix tracks",
-    "an MRtrix image": rb"mrtrix image",
+    "values per vertex of FreeSurfer": rb"\xff{3}",
     "a BrainVISA mesh": rb"(ascii|binar)(DCBA|ABCD)",
     "a binary MNI surface": rb"p[\0-\xff]{3}[\x3c-\x3f]",
     "an NPY array": rb"\x93NUMPY",
@@ -408,13 +405,13 @@ def format_of(data: bytes) -> str:
         return "STL"
     if is_utf_16(data):
         raise ValueError("text in UTF-16 found: save it as UTF-8")
-    kind = next((kind for kind, magic in _MAGICS.items() if re.match(magic, data, re.DOTALL)), "")
-    if not kind and _is_binary_stl(data):
+    other = next((kind for kind, magic in _MAGICS.items() if re.match(magic, data, re.DOTALL)), "")
+    if not other and _is_binary_stl(data):
         return "STL"
-    if not kind and b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
+    if not other and b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
         return "OBJ"
     what = f"{len(data)} bytes" + " of an unknown format" * bool(data)
-    found = f"{kind}: export the surface as one of them" if kind else what
+    found = f"{other}: export the surface as one of them" if other else what
     raise ValueError(f"one of {', '.join(FORMATS)} expected, found {found}")
 
 
@@ -441,7 +438,7 @@ def _need(expected, found, what):
 
 # PLY
 
-_PLY_TYPES = {
+PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
     "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
     "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
@@ -518,7 +515,7 @@ def _ply_header(text):
         elif words[:1] == ["element"]:
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
-            types = [_PLY_TYPES.get(word) for word in words[1:-1] if word != "list"]
+            types = [PLY_TYPES.get(word) for word in words[1:-1] if word != "list"]
             if not elements or not all(types):
                 line = " ".join(words)[:80]
                 raise ValueError(

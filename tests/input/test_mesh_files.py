@@ -367,7 +367,7 @@ def test_files_of_other_kinds_are_named(tmp_path, content, words):
 def test_a_compressor_that_is_not_read_is_named_with_the_remedy(tmp_path):
     _, _, given = SEEDS["VTP"]
     content = next(c for c, finish in given if finish is fuzz.whole and b"ZLibDataComp" in c)
-    with pytest.raises(ValueError, match="found vtkLZ4DataCompressor: save it with .* ZLib, or w"):
+    with pytest.raises(ValueError, match=r"found vtkLZ4DataCompressor: save it with .* ZLib"):
         read_mesh(file(tmp_path, "m.vtp", content.replace(b"vtkZLib", b"vtkLZ4")))
 
 
