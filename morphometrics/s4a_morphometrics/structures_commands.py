@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from s4a.cli.commands import exit_code, new_folder, on_cluster, within, write
+from s4a.cli.commands import SYSTEM, exit_code, new_folder, on_cluster, within, write
 from s4a.cli.flags import Command, add_options, whole
 from s4a.options import DECLARED
 
@@ -41,7 +41,9 @@ def insert(args: Namespace) -> int:
     from s4a_morphometrics.several import insert_structures, open_structures
 
     study = open_structures(args.study)
-    options = {name: getattr(args, name) for name in ("landmarks", "reflect", "table", "n_jobs")}
+    options = {
+        name: getattr(args, name) for name in ("landmarks", "reflect", "table", *SYSTEM, "n_jobs")
+    }
     inserted = insert_structures(study, args.shapes, **options)
     out = new_folder(args.out)
     path = write_inserted(inserted, out)
@@ -131,7 +133,7 @@ def _insert(add: Callable[..., Any]) -> None:
     add("--reflect", metavar="NAMES", help=text)
     add("--table", metavar="PATH", help=TABLE)
     _fail_on(add)
-    add_options(add, ["n_jobs"])
+    add_options(add, [*SYSTEM, "n_jobs"])
 
 
 def _compare(add: Callable[..., Any]) -> None:

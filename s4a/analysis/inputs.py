@@ -21,7 +21,7 @@ from s4a.input.subjects import (
     non_numeric_text,
 )
 from s4a.method.pca import pca_without
-from s4a.options import Options, with_options
+from s4a.options import Options, kept_options, with_options
 from s4a.schema import check_type, require, unit_of
 from s4a.study.tree import left_out
 
@@ -164,11 +164,10 @@ def with_flagged(study: xr.DataTree) -> xr.DataTree:
     check_type(study, xr.DataTree)
     nodes = {node.path: node.to_dataset(inherit=False) for node in study.subtree}
     if "report" in study.children:
-        nodes["/report"] = nodes["/report"].assign_attrs(
-            with_options(
-                nodes["/report"].attrs, {"include_flagged": True, "quality_control": "exclude"}
-            )
-        )
+        attrs = nodes["/report"].attrs
+        is_stop = kept_options(study).get("quality_control") == "stop"
+        given = {"include_flagged": True} | ({"quality_control": "exclude"} if is_stop else {})
+        nodes["/report"] = nodes["/report"].assign_attrs(with_options(attrs, given))
     registration = all_registered(study)
     template = registration.attrs.get("template", "")
     coarse = nodes.get(f"/coarse/{template}")

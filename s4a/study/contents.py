@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.input.files import slug
-from s4a.schema import HOLDS, POINTS_INTO, TABLE, TEXTS
+from s4a.schema import HOLDS, OMITTED, POINTS_INTO, TABLE, TEXTS
 
 SIZES = {"xyz": 3, "xyz_2": 3, "corner": 3, "end": 2}
 # kind of file -> (dim, other file, dim of the same size there); {template} is that of registration
@@ -130,7 +130,7 @@ def check_variable(name: str, values: xr.Variable, needed: bool) -> None:
     if not is_coordinate and name not in TABLE:
         raise ValueError(f"{name} is not a variable of a study")
     dims = (name,) if is_coordinate else TABLE[name][0]
-    of_shape = dims[1:] if dims[0:1] in (("shape",), ("pair",)) and not is_coordinate else dims
+    of_shape = dims[1:] if dims and dims[0] in OMITTED and not is_coordinate else dims
     if values.dims not in (dims, of_shape):
         raise ValueError(f"{name} needs the dims {dims}, found {values.dims}")
     kinds, what = "iuf", "numbers"

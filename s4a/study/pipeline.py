@@ -16,6 +16,7 @@ from joblib import effective_n_jobs, parallel_config
 
 from s4a.input.chirality import AUTO, mean_chirality, mirrored_shapes, to_reflect
 from s4a.input.collection import remarks_on_files
+from s4a.input.coordinates import CoordinateSystem
 from s4a.input.plausibility import Flags
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
@@ -32,6 +33,7 @@ from s4a.study.quality_control import (
     comparisons_of,
     exclude_flagged,
     stop_if_flagged,
+    unflagged,
 )
 from s4a.study.report import write_report
 from s4a.study.runner import Keys, Run, Task, names_and_keys
@@ -40,6 +42,7 @@ from s4a.study.sources import (
     Marked,
     Sources,
     check_one_structure,
+    common_system,
     find_guides,
     find_sources,
     remarks_on_guides,
@@ -184,6 +187,8 @@ def analyse(
     subjects = None if settings.table is None else read_table(settings.table, list(sources))
     if subjects is not None:
         check_one_structure(subjects)
+    system, on_systems = common_system(sources, settings)
+    remarks += on_systems
     settings.check_against(list(sources))
     marked = find_guides(sources, settings.landmarks, settings.feature_names)
     with lock(store) as claim:
@@ -194,12 +199,17 @@ def analyse(
             remarks = remarks + remarks_on_table(run.folder / "subjects.nc", sources)
         remarks = remarks + remarks_on_guides(sources, marked, settings.feature_names)
         with run.report_unforeseen():
-            run_steps(run, sources, marked, settings, remarks)
+            run_steps(run, sources, marked, settings, remarks, system)
     return open_study(store)
 
 
 def run_steps(
-    run: Run, sources: Sources, marked: Marked, options: Options, remarks: list[str]
+    run: Run,
+    sources: Sources,
+    marked: Marked,
+    options: Options,
+    remarks: list[str],
+    system: CoordinateSystem | None,
 ) -> None:
     """Run all steps of the paper; each skips files that are done."""
     # dependencies of the files; a key contains those of all files before it:
@@ -209,8 +219,8 @@ def run_steps(
     #   network/descriptor_*, comparison_*    latent/* of excluded -> registration/* <- registration
     #                                                     |
     #                                                pca, report
-    reflected, on_chirality = choose_reflected(run, sources, marked, options)
-    original = read_and_clean(run, sources, marked, options, reflected)
+    reflected, on_chirality = choose_reflected(run, sources, marked, options, system)
+    original = read_and_clean(run, sources, marked, options, reflected, system)
     original, flags, on_shapes = check_plausibility(run, original, options)
     stop_if_flagged(flags, options)
     coarse = remesh(run, original, options)
@@ -222,19 +232,30 @@ def run_steps(
     registered = register(run, coarse | excluded, inserted, latent, options)
     failed, on_registrations = check_registrations(run, registered, inserted)
     flags = {name: [*flags.get(name, []), *failed.get(name, [])] for name in registered}
+    flags = unflagged(flags) if options.quality_control == "off" else flags
     why_no_modes = modes(run, registered, flags, options)
     remarks = [*on_chirality, *on_exclusion, *on_shapes, *on_registrations, *remarks]
     write_report(run, sources, options, remarks, why_no_modes, registered, flags)
 
 
 def read_and_clean(
-    run: Run, sources: Sources, marked: Marked, options: Options, reflected: list[str]
+    run: Run,
+    sources: Sources,
+    marked: Marked,
+    options: Options,
+    reflected: list[str],
+    system: CoordinateSystem | None,
 ) -> Keys:
-    """Read and clean the shapes, add landmarks and fields, mirror some (5.1): ``/original``."""
+    """Read and clean the shapes, add landmarks and fields, mirror some (5.1): ``/original``.
+
+    If there is a `system`, axes and unit of all shapes are converted to it.
+    """
     cleaning = options.of("cleaning")
     todo = []
     for n, (source, content) in sources.items():
         also: dict[str, Any] = {"reflected": True} if n in reflected else {}
+        if system is not None:
+            also["system"] = system.attrs
         key = (content, cleaning, *also.values())
         if n in marked:
             also["guides"] = landmarks, features = marked[n]
@@ -247,7 +268,11 @@ def read_and_clean(
 
 
 def choose_reflected(
-    run: Run, sources: Sources, marked: Marked, options: Options
+    run: Run,
+    sources: Sources,
+    marked: Marked,
+    options: Options,
+    system: CoordinateSystem | None,
 ) -> tuple[list[str], list[str]]:
     """Choose the shapes to mirror; return their names, and remarks.
 
@@ -265,8 +290,9 @@ def choose_reflected(
     file = run.folder / CHOICE
     contents = [content for _, content in sources.values()]
     key = task_key(list(sources), contents, options.of("cleaning"), options.k, AUTO)
+    key = key if system is None else task_key(key, system.attrs)
     if not is_done(file, key):
-        original = read_and_clean(run, sources, marked, options, [])
+        original = read_and_clean(run, sources, marked, options, [], system)
         comparisons = comparisons_of(run, original, options) if len(original) > 1 else {}
         reflected, remarks = mirrored_shapes(comparisons)
         choice = dataset(
@@ -343,7 +369,7 @@ def initial_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys
     names, k_init = list(coarse), spectra.shape[1]
     pairs = choose_pairs(spectral_distance(spectra), options.n_pairs)
     batches = in_batches([[names[i], names[j]] for i, j in pairs])
-    settings = (k_init, options.of("initial maps"))
+    settings = (k_init, options.of("initial maps"), options.keep_iterations)
     files = {f"network/initial_{i:03d}.nc": batch for i, batch in enumerate(batches)}
     todo = [
         Task(f, f, map_pairs, (run.folder, batch, *settings), (aligned, batch, *settings))
@@ -376,6 +402,7 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
     settings = (options.k, options.step, options.n_latent, options.norm)
     iteration_settings = (
         options.weights,
+        options.isometric,
         options.n_samples,
         options.dense_iterations,
         options.keep_iterations,

@@ -116,8 +116,9 @@ def exclude_flagged(
 ) -> tuple[Flags, Keys, Keys, list[str]]:
     """Split the shapes into those of the network and flagged ones, excluded from it.
 
-    Shapes with fewer eigenfunctions than most others fail.  If fewer than two shapes are not
-    flagged, there is no reference to compare with, and all flags are lifted.
+    Shapes with fewer eigenfunctions than most others fail.  All flags are lifted with
+    ``quality_control="off"``, and if fewer than two shapes are not flagged, since there is no
+    reference to compare with.
 
     Returns
     -------
@@ -126,13 +127,14 @@ def exclude_flagged(
         Keys of the low-resolution meshes of both.
     remarks : list of str
     """
+    flags = unflagged(flags) if options.quality_control == "off" else flags
     count = {n: len(arrays(run.folder / f"coarse/{n}.nc", "eigenvalue")[0]) for n in coarse}
     is_flagged = {n: any(flag.flagged for flag in flags.get(n, [])) for n in coarse}
     # a template that the user names is trusted
     trusted = [n for n in coarse if n == options.template or not is_flagged[n]]
     remarks = []
     if len(trusted) < 2:
-        flags = {n: [flag._replace(flagged=False) for flag in flags.get(n, [])] for n in flags}
+        flags = unflagged(flags)
         if len(coarse) > 1:
             remarks = [
                 f"{len(coarse) - len(trusted)} of {len(coarse)} shapes are flagged, too many to "
@@ -151,6 +153,11 @@ def exclude_flagged(
     excluded = {n: coarse[n] for n in coarse if n not in trusted and count[n] >= k}
     check_usable(run, network, options)
     return flags, network, excluded, remarks
+
+
+def unflagged(flags: Flags) -> Flags:
+    """Return the flags as warnings, which exclude no shape."""
+    return {name: [flag._replace(flagged=False) for flag in flags[name]] for name in flags}
 
 
 def usable_k(counts: Sequence[int], k: int) -> int:

@@ -19,6 +19,7 @@ from joblib import delayed, effective_n_jobs
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
+from s4a.input.raw import sentences
 from s4a.study.netcdf import is_done
 from s4a.study.processes import died, interruption_kept, workers
 from s4a.study.progress import Notes, Stage
@@ -340,7 +341,7 @@ def in_a_line(error: BaseException) -> str:
     'IndexError: too large'
     """
     text = " ".join(str(error).split())
-    return type(error).__name__ + (f": {text[:300]}" if text else "")
+    return type(error).__name__ + (f": {sentences(text, 300)}" if text else "")
 
 
 def note(file: Path, text: str) -> None:

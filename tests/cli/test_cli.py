@@ -206,6 +206,9 @@ def test_a_flag_means_one_thing_in_all_commands():
                 found.setdefault(names[-1], {}).setdefault(kind, []).append(name)
 
         one.flags(add)
+    # the methods that `compare` compares have no fast preset
+    presets = {choices for _, choices, _ in found.pop("--preset")}
+    assert presets == {("paper", "fast"), ("paper",)}
     assert {flag: kinds for flag, kinds in found.items() if len(kinds) > 1} == {}
 
 
