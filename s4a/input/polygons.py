@@ -99,15 +99,14 @@ def triangulated(X: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple
     # 3---2   the first corner and each opposite side
     # | / |
     # 0---1
+    if (sizes == 3).all():
+        return corners.reshape(-1, 3), 0
     begin, count = np.cumsum(sizes) - sizes, np.maximum(sizes - 2, 0)
     T, first, n_crossing = np.empty((count.sum(), 3), corners.dtype), np.cumsum(count) - count, 0
     rounding = 2e-7 * np.abs(X[np.isfinite(X)]).max(initial=0)  # of single precision
     for size in np.unique(sizes[count > 0]).tolist():
         which, at = np.flatnonzero(sizes == size), np.arange(size)
         rows = corners[begin[which, None] + at]  # (q, size)
-        if size == 3:
-            T[first[which]] = rows
-            continue
         folded, is_planar = _fans(X[rows], rounding)
         again = np.flatnonzero(folded | ~is_planar)
         lowest = rows[again].argmin(axis=1)[:, None]
