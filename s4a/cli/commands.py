@@ -59,7 +59,7 @@ def doctor(folder: str = ".") -> int:
     return 1 if missing else 0
 
 
-def exit_code(statuses: "list[xr.DataArray]", fail_on: str, otherwise: int) -> int:
+def exit_code(statuses: "list[Any]", fail_on: str, otherwise: int) -> int:
     """Return 3 if a shape has the status that --fail-on names, or is excluded with "flagged"."""
     failed = {"none": [], "excluded": ["excluded"], "flagged": ["flagged", "excluded"]}[fail_on]
     return 3 if any(status.isin(failed).any() for status in statuses) else otherwise

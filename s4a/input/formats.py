@@ -243,7 +243,10 @@ def _parse_vtp(data):
     file = VtkXml(data)
     points, cells, n_before = [np.empty((0, 3))], [], 0
     for piece in file.root.iter("Piece"):
-        X = file.values(piece.find("Points/DataArray")).reshape(-1, 3)
+        node = piece.find("Points/DataArray")
+        if node is None:
+            raise ValueError("an array of points expected, found none")
+        X = file.values(node).reshape(-1, 3)
         counts = {"NumberOfPoints": len(X)}
         for name in ("Polys", "Strips"):
             arrays = {"connectivity": np.empty(0, np.int64), "offsets": np.empty(0, np.int64)}
