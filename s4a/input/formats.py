@@ -406,6 +406,9 @@ _MAGICS = {
     "a picture": rb"\x89PNG|\xff\xd8\xff|GIF8|II\*\0|MM\0\*",
     "a PDF file": rb"%PDF",
     "a compressed file": rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|\x28\xb5\x2f\xfd|Rar!",
+    "a pointer of Git LFS": rb"version https://git-lfs",
+    "a web page": rb"\s*<(![dD][oO][cC][tT][yY][pP][eE] )?(html|HTML)",
+    "a COLLADA or X3D file": rb"\s*<.{0,1000}<(COLLADA|X3D)\b",
     "a program": rb"\x7fELF|MZ[\x80-\xff]",
 }
 
@@ -656,6 +659,8 @@ def _read_off(data):
     if min(n, m) < 0:
         raise ValueError(f"counts from 0 expected, found {n} vertices and {m} faces")
     _need(n + m, len(lines) - 1, "lines of vertices and faces")
+    if any(line.lstrip().startswith(b"OFF") for line in lines[n + m + 1 :]):
+        raise ValueError("one mesh expected, found a second OFF: write each to a file of its own")
     points = np.array([line.split()[:3] for line in lines[1 : n + 1]], np.float64)
     corners, sizes = [], []
     for line in lines[n + 1 : n + 1 + m]:
@@ -669,7 +674,9 @@ def _read_off(data):
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-_STL_FACETS = re.compile(rb"^[ \t]*(?:facet|endsolid)\b", re.I | re.M)  # names are free text
+# at the start of a line, as the name of a solid is free text
+_STL_FACETS = re.compile(rb"[\r\n][ \t]*(facet|endsolid)\b", re.I)
+_STL_VERTEX = re.compile(rb"[\r\n][ \t]*vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.I)
 
 
 def _is_binary_stl(data):
@@ -695,8 +702,7 @@ def _read_stl(data):
     count = int.from_bytes(data[80:84], "little")
     starts_as_ascii = re.match(rb"\s*solid\b", data, re.I) and b"\0" not in data[:1000]
     if starts_as_ascii and len(data) != 84 + 50 * count:
-        vertices = re.findall(rb"^[ \t]*vertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.I | re.M)
-        words = [word.split()[0].lower() for word in _STL_FACETS.findall(data)]
+        vertices, words = _STL_VERTEX.findall(data), _STL_FACETS.findall(data.lower())
         _need(3 * words.count(b"facet"), len(vertices), "vertices of facets")
         _need(1, words.count(b"endsolid"), "endsolid")
         corners = np.array(vertices, np.float64)
@@ -840,7 +846,8 @@ def _read_npz(data):
     keys = next((keys for keys in NPZ_KEYS if set(keys) <= set(arrays)), None)
     if keys is None:
         wanted = " or ".join(" and ".join(keys) for keys in NPZ_KEYS)
-        raise ValueError(f"the keys {wanted} expected, found {', '.join(arrays) or 'none'}")
+        found = ", ".join(arrays) or "nothing"
+        raise ValueError(f"the keys {wanted} expected, found a ZIP archive of {found}")
     points, triangles = (arrays[key]() for key in keys)
     if triangles.dtype.kind not in "iu":
         raise ValueError(f"integer indices expected in {keys[1]}, found {triangles.dtype}")
