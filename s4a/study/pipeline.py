@@ -192,7 +192,9 @@ def analyse(
     settings.check_against(list(sources))
     marked = find_guides(sources, settings.landmarks, settings.feature_names)
     with lock(store) as claim:
-        run = Run(claim, limited(limited(n_jobs), len(sources)))
+        n = len(sources)
+        n_tasks = max(n, n * (n - 1) // 8)  # of shapes, or of four pairs each
+        run = Run(claim, limited(limited(n_jobs), n_tasks))
         if subjects is not None:
             write(with_contents(subjects, sources), run.folder / "subjects.nc", name="subjects")
         else:
