@@ -50,17 +50,12 @@ def strips(corners: np.ndarray, sizes: np.ndarray) -> Polygons:
     # 1---3   0, 1, 2 and 3, 2, 1
     # | \ |
     # 0---2
-    first, step = _steps(sizes)
-    odd = step % 2
-    triangles = np.stack([first + step + 2 * odd, first + step + 1, first + step + 2 - 2 * odd], 1)
-    return corners[triangles].ravel(), np.full(len(triangles), 3)
-
-
-def _steps(sizes):
-    """First corner of the polygon of each triangle, and number of the triangle in its polygon."""
-    count = np.maximum(sizes - 2, 0)  # triangles of each polygon
+    count = np.maximum(sizes - 2, 0)  # triangles of each strip
     first = np.repeat(np.cumsum(sizes) - sizes, count)
-    return first, np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    first, odd = first + step, step % 2
+    triangles = np.stack([first + 2 * odd, first + 1, first + 2 - 2 * odd], axis=1)
+    return corners[triangles].ravel(), np.full(len(triangles), 3)
 
 
 def triangulated(X: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, int]:
