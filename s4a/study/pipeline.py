@@ -191,7 +191,9 @@ def analyse(
     settings.check_against(list(sources))
     marked = find_guides(sources, settings.landmarks, settings.feature_names)
     with lock(store) as claim:
-        run = Run(claim, limited(limited(n_jobs), len(sources)), system)
+        n = len(sources)
+        n_tasks = max(n, n * (n - 1) // 8)  # of shapes, or of four pairs each
+        run = Run(claim, limited(limited(n_jobs), n_tasks), system)
         if subjects is not None:
             write(with_contents(subjects, sources), run.folder / "subjects.nc", name="subjects")
         else:
@@ -407,7 +409,14 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
         )
         for node in [*iterations, "network", "latent"]:
             made_from = names_and_keys("coarse", coarse)
-            write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, made_from, name=node)
+            write(
+                tree[node].to_dataset(),
+                run.folder / f"{node}.nc",
+                key,
+                made_from,
+                run.claim,
+                name=node,
+            )
     return key
 
 
