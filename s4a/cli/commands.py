@@ -59,10 +59,10 @@ def doctor(folder: str = ".") -> int:
     return 1 if missing else 0
 
 
-def exit_code(report: "xr.Dataset", fail_on: str, otherwise: int) -> int:
-    """Return 3 if a shape of a report has a status that --fail-on names, or a worse one."""
+def exit_code(statuses: "list[Any]", fail_on: str, otherwise: int) -> int:
+    """Return 3 if a shape has the status that --fail-on names, or is excluded with "flagged"."""
     failed = {"none": [], "excluded": ["excluded"], "flagged": ["flagged", "excluded"]}[fail_on]
-    return 3 if report["status"].isin(failed).any() else otherwise
+    return 3 if any(status.isin(failed).any() for status in statuses) else otherwise
 
 
 def run(
@@ -85,7 +85,7 @@ def run(
     cluster : ADDRESS
         dask scheduler tcp://host:port, or local:N worker processes
     fail_on
-        end with exit code 3 if shapes were excluded, or if shapes were flagged or excluded
+        end with exit code 3 if shapes are excluded, or if shapes are flagged or excluded
 
     Examples
     --------
@@ -101,7 +101,7 @@ def run(
     lines = [tables.report_table(report), *tables.cost_lines(report)]
     full.write_text("\n".join(lines) + "\n", encoding="utf-8")
     write(tables.run_summary(study, again=again), *tables.place_lines(out, str(full)))
-    return exit_code(report, fail_on, 1 if study["report"].attrs["unforeseen"] else 0)
+    return exit_code([report["status"]], fail_on, 1 if study["report"].attrs["unforeseen"] else 0)
 
 
 @contextlib.contextmanager
@@ -384,7 +384,7 @@ def insert(
     reflect : NAMES
         new shapes to mirror: names separated by commas; or auto, those mirrored to the study
     fail_on
-        end with exit code 3 if shapes were excluded, or if shapes were flagged or excluded
+        end with exit code 3 if shapes are excluded, or if shapes are flagged or excluded
     """
     tree = s4a.open_study(study)
     given = {"landmarks": landmarks, "reflect": reflect, "n_jobs": n_jobs} | system
@@ -394,8 +394,8 @@ def insert(
     s4a.write_registered(inserted, folder)
     write(tables.inserted_table(inserted), "")
     write(f"written: {path}, registered meshes and scores in {folder}")
-    report = inserted["report"].to_dataset()
-    return exit_code(report, fail_on, 1 if (report["status"] == "excluded").any() else 0)
+    status = inserted["report"]["status"]
+    return exit_code([status], fail_on, 1 if (status == "excluded").any() else 0)
 
 
 def transfer(

@@ -26,6 +26,7 @@ from s4a.schema import dataset
 from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
 from s4a.study.processes import limited, temporary_folder
 from s4a.study.quality_control import (
+    check_modes,
     check_plausibility,
     check_registrations,
     check_usable,
@@ -190,7 +191,9 @@ def analyse(
     settings.check_against(list(sources))
     marked = find_guides(sources, settings.landmarks, settings.feature_names)
     with lock(store) as claim:
-        run = Run(claim, limited(limited(n_jobs), len(sources)), system)
+        n = len(sources)
+        n_tasks = max(n, n * (n - 1) // 8)  # of shapes, or of four pairs each
+        run = Run(claim, limited(limited(n_jobs), n_tasks), system)
         if subjects is not None:
             write(with_contents(subjects, sources), run.folder / "subjects.nc", name="subjects")
         else:
@@ -226,7 +229,7 @@ def run_steps(
     failed, on_registrations = check_registrations(run, registered, inserted)
     flags = {name: [*flags.get(name, []), *failed.get(name, [])] for name in registered}
     flags = unflagged(flags) if options.quality_control == "off" else flags
-    why_no_modes = modes(run, registered, flags, options)
+    why_no_modes, flags = modes(run, registered, flags, options)
     remarks = [*on_chirality, *on_exclusion, *on_shapes, *on_registrations, *remarks]
     write_report(run, sources, options, remarks, why_no_modes, registered, flags)
 
@@ -406,7 +409,14 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
         )
         for node in [*iterations, "network", "latent"]:
             made_from = names_and_keys("coarse", coarse)
-            write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, made_from, name=node)
+            write(
+                tree[node].to_dataset(),
+                run.folder / f"{node}.nc",
+                key,
+                made_from,
+                run.claim,
+                name=node,
+            )
     return key
 
 
@@ -478,8 +488,15 @@ def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Optio
     return registered
 
 
-def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> str:
-    """Compute the modes of variation (6.1), ``/pca``; return the reason if there are none.
+def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> tuple[str, Flags]:
+    """Compute the modes of variation (6.1), ``/pca``.
+
+    Returns
+    -------
+    why_no_modes : str
+        The reason if there are none.
+    flags : dict of str to list of Flag
+        Flags of the registered shapes, with the warnings of :func:`check_modes`.
 
     Flagged shapes are excluded; their scores are computed along the modes of the others.
     """
@@ -501,7 +518,8 @@ def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> str:
         except ValueError as error:
             log.warning("no modes: %s", error)
             (run.folder / "pca.nc").unlink(missing_ok=True)
-            return str(error)
+            return str(error), flags
         made_from = names_and_keys("registration", registered)
         write(result, run.folder / "pca.nc", task_key(keys), made_from, name="pca")
-    return ""
+        warned = check_modes(result, float(data["vertex_area"].sum()))
+    return "", {name: [*flags[name], *warned.get(name, [])] for name in flags}
