@@ -9,7 +9,8 @@ from threadpoolctl import threadpool_limits
 
 from s4a.input.collection import Mesh, as_mesh
 from s4a.method import fmap
-from s4a.method.initial_map import initial_map, transform_onto
+from s4a.method.alignment import align_onto
+from s4a.method.initial_map import initial_map
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.register import refine_at_full_resolution, register
 from s4a.method.shape import Shape
@@ -136,7 +137,8 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     N = target.low
     k = min(options.k, M.k, N.k)
     k_init = min(options.k_init, k)
-    transform = transform_onto(M, N)
+    aligned = align_onto(M, N, options.alignment)
+    transform = aligned.transform
     initial_refinement = options.initial_refinement == "always"
     initial = initial_map(
         M,

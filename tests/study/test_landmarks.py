@@ -27,7 +27,7 @@ from s4a.input.annotations import write_landmarks
 from s4a.input.chirality import mirror_image
 from s4a.input.files import files_named
 from s4a.input.landmarks import SUFFIXES
-from s4a.method.initial_map import transform_onto
+from s4a.method.alignment import transform_onto
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.shape import Shape
 from s4a.schema import dataset
