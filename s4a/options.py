@@ -322,8 +322,8 @@ class Options:
     n_pairs: int = network(500, "number of pairs in the network, each with maps in both directions",
         least=1, section="5.1", more="All pairs are used if there are fewer")
     alignment: str = network("search",
-        "rigid alignment: the best of several results of ICP in position and normal (search), plain "
-        "ICP from the pose of the files (icp), or that pose, with centroids aligned (given)",
+        "rigid alignment: the best of several results of ICP in position and normal (search), "
+        "plain ICP from the pose of the files (icp), or that pose, with centroids aligned (given)",
         choices=("search", "icp", "given"), paper="icp", section="4.1, step 2",
         instead="ICP from the pose of the files", see="method/alignment", of="initial maps",
         pair=True,

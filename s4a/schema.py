@@ -364,7 +364,8 @@ HOLDS = {
     ),
     "network/comparison": ("moment fit fit_mirrored chirality", "", SEEN),
     "network/chirality": ("shape mean_chirality reflected", "remarks", ""),
-    "network/alignment": ("rotation translation", "reference", ""),
+    "network/voters": ("shape rotation translation", "", ""),
+    "network/alignment": ("rotation translation", "reference ambiguity", "n_poses"),
     "network/initial": ("source target fmap_initial", "", ""),
     "network": ("source target fmap_initial fmap weight cycle_error", "", ""),
     "latent": (

@@ -304,13 +304,9 @@ def _best_pose(shape, reference):
         As of :func:`s4a.geometry.align.icp_each`.
     """
     initial = initial_transforms(shape.cloud, reference.cloud)
-    rough = icp_each(
-        shape.rough, reference.rough, initial, tolerance=1e-3, iterations=5, trim=TRIM
-    )
+    rough = icp_each(shape.rough, reference.rough, initial, tolerance=1e-3, iterations=5, trim=TRIM)
     best = [(R, t) for R, t, _ in sorted(rough, key=residual_of)[:2]]
-    poses = icp_each(
-        shape.cloud, reference.cloud, best, tolerance=1e-4, iterations=30, trim=TRIM
-    )
+    poses = icp_each(shape.cloud, reference.cloud, best, tolerance=1e-4, iterations=30, trim=TRIM)
     return min(poses, key=residual_of)
 
 
@@ -398,6 +394,9 @@ KINDS = {
     "kind": (False, "outlier: {what} {deviations:.0f} robust deviations from the median; is it "
         "another kind of shape, stretched, or only a part? Remove it if it does not belong "
         "to the collection", "remove the files if they are of another kind"),
+    "pose": (True, "ambiguous pose: {number} poses fit alike (residual {best:.3f}, and rotated by "
+        "{angle:.0f} degrees {second:.3f} sqrt(area)); give landmarks=, or alignment='given' if "
+        "the files are aligned", "give --landmarks, or --alignment given if the files are aligned"),
     "registration": (True, "registration {sure} (score {registration_error:.3f}{distortion}): "
         "inspect it with s4a view, compare its file with the template's, or remove it",
         "look at the page; a larger --n-coarse may help"),
@@ -405,6 +404,9 @@ KINDS = {
 # fmt: on
 # kind: attribute of the comparison, and the least value that is reported
 _MUCH_MORE_OF = {"intersections": ("intersecting", _CROSSING), "spacing": ("lattice", _LATTICE)}
+
+
+POSE = "pose"  # the kind of a flag for an ambiguous pose
 
 
 class Flag(NamedTuple):

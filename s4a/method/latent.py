@@ -17,8 +17,8 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import cKDTree
 
 from s4a.geometry.align import RigidTransform
-from s4a.method.fmap import fmap_from_match
 from s4a.method.alignment import pair_transform
+from s4a.method.fmap import fmap_from_match
 from s4a.method.initial_map import initial_map
 from s4a.method.median import area_differences, conformal_differences, distance_to_identity
 from s4a.method.nearest import (

@@ -687,8 +687,9 @@ def register_shape(
         the report of the study.
     **options
         ``refine``, ``remove_size``, ``articulated``, ``alignment``, ``displacement_alignment``,
-        ``n_projected`` and ``area_weighted``.  :class:`s4a.Options` describes them.  Options that are missing or None
-        have the values in the report of the study, or their defaults if there is no report.
+        ``n_projected`` and ``area_weighted``.  :class:`s4a.Options` describes them.  Options that
+        are missing or None have the values in the report of the study, or their defaults if there
+        is no report.
 
     Returns
     -------

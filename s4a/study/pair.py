@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from s4a.input.collection import Mesh, as_mesh
 from s4a.method import fmap
-from s4a.method.alignment import align_onto
+from s4a.method.alignment import align_onto, less_confident
 from s4a.method.initial_map import initial_map
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.register import refine_at_full_resolution, register
@@ -159,8 +159,12 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     registration = register(
         source, target, initial_matches, functions, transform, k=k, **options.of("registration")
     )
+    if aligned.ambiguity:
+        log.warning("%s", aligned.ambiguity)
+    registration = less_confident(registration, len(aligned.fits))
     maps = dataset(fmap=C, fmap_initial=initial.C, fmap_fitted=initial.fitted)
     if initial.landmarks is not None:
         at_source, at_target = initial.landmarks
         maps = maps.merge(dataset(landmark_of_source=at_source, landmark_of_target=at_target))
-    return registration.assign_attrs(initial_map=initial.name), maps
+    attrs = {"initial_map": initial.name, "ambiguity": aligned.ambiguity}
+    return registration.assign_attrs(attrs), maps
