@@ -30,7 +30,6 @@ from scipy.sparse.csgraph import dijkstra
 
 import s4a
 from s4a import synthetic
-from s4a.geometry.align import cloud, icp
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.initial_map import landmarks_after_alignment
@@ -100,12 +99,6 @@ def pyfm_fit(source, target, transform, *, k_init=20, init="landmarks", near=Non
     return model.FM_12, landmarks
 
 
-def one_start(X, area, Y, area_y):
-    """ICP from the pose as given alone, centroids on each other."""
-    shift = area_y @ Y / area_y.sum() - area @ X / area.sum()
-    return icp(cloud(X, area), cloud(Y, area_y), np.eye(3), shift)
-
-
 # what is put in the place of ours, where there is no switch
 INSTEAD = {
     "U by closest points in space": {"s4a.method.remesh.closest_point_in_star": closest_in_space},
@@ -113,7 +106,6 @@ INSTEAD = {
         "s4a.method.remesh.closest_point_in_star": closest_in_space,
         "s4a.method.remesh.sample_surface": geodesic_farthest,
     },
-    "ICP from one start": {"s4a.method.initial_map.align": one_start},
     "initial maps of pyFM": {"s4a.method.initial_map.fit_after_alignment": pyfm_fit},
     "weights of the linear program": {"s4a.method.latent.cycle_errors": program_errors},
 }
@@ -128,7 +120,8 @@ ON_THE_PAPER = {
     "n_samples": {"n_samples": DEFAULTS["n_samples"]},
     "dense_iterations": {name: DEFAULTS[name] for name in ("n_samples", "dense_iterations")},
     "articulated": {"refine": "elastic", "articulated": True},
-    "alignment": {"alignment": "fitted"},
+    "alignment": {"alignment": "search"},
+    "displacement_alignment": {"displacement_alignment": "fitted"},
     "area_weighted": {"area_weighted": True},
     "n_projected": {"n_projected": N_PROJECTED},
 }

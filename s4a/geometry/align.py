@@ -219,7 +219,7 @@ def cloud(
     default.
     """
     if paired is None or isinstance(paired, int):
-        paired = farthest_points(X, paired or len(X))
+        paired = farthest_points(X, len(X) if paired is None else paired)
     bare = Cloud(X, area, cKDTree(X), paired, normals)
     return bare if normals is None else bare._replace(tree=cKDTree(bare.rows()))
 
@@ -364,7 +364,10 @@ def poses(source: Cloud, target: Cloud) -> list[IcpResult]:
     """
     starts = initial_transforms(source, target)
     if len(starts) > N_POSES:
-        few = [c._replace(paired=c.paired[:N_ROUGH]) for c in (source, target)]
+        few = [
+            c._replace(paired=c.paired[farthest_points(c.X[c.paired], N_ROUGH)])
+            for c in (source, target)
+        ]
         ends = icp_each(*few, starts, tolerance=1e-3, iterations=15)
         starts = [(R, t) for R, t, _ in distinct(ends)[:N_POSES]]
     return distinct(icp_each(source, target, starts, tolerance=ROUGH))
