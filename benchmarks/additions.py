@@ -34,7 +34,7 @@ from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.initial_map import landmarks_after_alignment
 from s4a.method.remesh import silence
-from s4a.options import PRESETS
+from s4a.options import DECLARED, PRESETS
 from s4a.schema import dataset
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -132,6 +132,7 @@ READINGS = {
     "weights": "equal",
     "n_latent": 90,
     "step": 10,
+    "isometric": True,
 }
 NORMS = ("h2", "h1", "frobenius", "h2_image", "h2_both")
 OF_A_PAIR = ("refine", "init", "initial_refinement", "full_resolution_iterations", "bidirectional")
@@ -152,11 +153,7 @@ def study_rows():
 
 def pair_rows():
     """The same of pairs that are matched on their own."""
-    paper = {
-        name: value
-        for name, value in PAPER.items()
-        if name not in ("n_samples", "dense_iterations")
-    }
+    paper = {name: value for name, value in PAPER.items() if DECLARED[name].metadata["pair"]}
     rows = {"pairs: paper": paper, "pairs: default": {}}
     for name in OF_A_PAIR:
         rows[f"pairs: paper, {name}"] = paper | {name: DEFAULTS[name]}

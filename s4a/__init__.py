@@ -6,7 +6,7 @@ The public names, by section of the paper:
 reading and cleaning      :func:`read_shapes`, :func:`read_shape`, :func:`read_labels`,
                           :func:`clean`, :func:`with_landmarks`, :func:`with_features`,
                           :func:`read_mesh`, :func:`write_mesh`
-4.1 low resolution        :func:`coarsen`
+4.1 low resolution        :func:`coarsen`, :func:`projection_operator`
 3.3 spectrum              :func:`spectrum`, :func:`reconstruct`
 4.1 pairs                 :func:`match_pair`
 5.1 metrics               :mod:`s4a.metrics`

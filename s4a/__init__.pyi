@@ -31,6 +31,7 @@ from .input.files import write_mesh as write_mesh
 from .input.landmarks import with_landmarks as with_landmarks
 from .method.pca import synthesize as synthesize
 from .method.remesh import coarsen as coarsen
+from .method.shape import projection_operator as projection_operator
 from .method.spectral import reconstruct as reconstruct
 from .method.spectral import spectrum as spectrum
 from .method.steps import align_pair as align_pair

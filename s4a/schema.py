@@ -113,17 +113,43 @@ pair_translation | pair xyz | share | translation t of ICP, source to target
 landmark_of_source | pair landmark | 1 | coarse vertices of the source used as landmarks for the
     initial map (4.1, step 3)
 landmark_of_target | pair landmark | 1 | coarse vertices of the target nearest to them after ICP
+pair_residual | pair | share | residual of ICP: root mean square distance of nearest
+    vertices, in both directions
+descriptor_of_source | pair eigenpair_source_initial descriptor | 1 | coefficients of descriptors of
+    the source, each of norm 1, to which the initial map is fitted (4.1, step 4)
+descriptor_of_target | pair eigenpair_target_initial descriptor | 1 | the same of the target
+descriptor_energy | pair | 1 | |C F - G|^2 of the fitted map, F and G the descriptors
+laplacian_energy | pair | 1 | the other term of the fit, the penalty for a map that does not commute
+    with the Laplacians
+spectral_distance | shape shape_2 | 1 | root mean square difference of log eigenvalues, which chose
+    pairs and reference
+icp_residual | shape | share | residual of ICP onto the reference
 weight | pair | 1 | weight of the map in the consistent latent basis, from its cycle error over all
     eigenfunctions
 cycle_error | pair | 1 | mean |C_cycle - I|_F over the 3-cycles through the pair, first k_init
     eigenfunctions, divided by sqrt(k_init)
 cycle_error_initial | pair | 1 | the same before Consistent ZoomOut
+iteration_size | iteration | 1 | size of the maps in each iteration of ZoomOut
+iteration_weight | iteration pair | 1 | weight of each map in each iteration
+iteration_cycle_error | iteration pair | 1 | mean |C_cycle - I|_F over the 3-cycles through the
+    pair, all eigenfunctions, divided by the root of their number: the weights follow from it
+iteration_fmap | iteration eigenpair_target eigenpair_source | 1 | functional map of each iteration
+    of ZoomOut; NaN beyond its size
+iteration_match | iteration low_vertex | 1 | coarse vertex of the source that it matches to each
+    coarse vertex of the target (eq. 2)
+matched_source | matched | 1 | coarse vertices of the source matched by eq. 3, pair after pair
+matched_target | matched | 1 | the coarse vertices of the target that they are matched to
+matched_count | pair | 1 | number of matched vertices of each pair
 # latent basis and median (3.4 - 3.6, eq. 3 and 5)
 latent_basis | shape eigenpair latent | 1 | consistent latent basis Y of each shape
 latent_eigenvalue | latent | unit area | eigenvalue of the latent (limit) shape
 area_difference | shape latent latent_2 | 1 | area-based shape difference D = Y^T Y
 conformal_difference | shape latent latent_2 | 1 | conformal shape difference
 distance_to_limit | shape | 1 | distance |D_i - I| of each shape to the limit shape (eq. 5)
+distance_by_norm | norm shape | 1 | the same in every interpretation of the norm of eq. 5
+area_component | difference_component latent latent_2 | 1 | principal component of the area-based
+    shape differences, of norm 1 (3.6)
+conformal_component | difference_component latent latent_2 | 1 | the same of the conformal ones
 area_score | shape difference_component | 1 | PCA scores of the area-based shape differences
 conformal_score | shape difference_component | 1 | PCA scores of the conformal shape differences
 area_variance_ratio | difference_component | 1 | share of variance of the area-based differences
@@ -270,6 +296,7 @@ warning | shape | 1 | findings that were left as they are
 flag_kinds | shape | 1 | kinds of findings for which the shape is flagged
 warning_kinds | shape | 1 | kinds of other findings
 path | shape | 1 | file of the shape
+coordinate_system | shape | 1 | coordinate system and unit of that file
 area | shape | L2 | area of the surface
 self_intersections | shape | 1 | triangles that intersect others, -1 if not counted
 file_vertices | shape | 1 | vertices in the file
@@ -365,7 +392,7 @@ HOLDS = {
     "network/comparison": ("moment fit fit_mirrored chirality", "", SEEN),
     "network/chirality": ("shape mean_chirality reflected", "remarks", ""),
     "network/voters": ("shape rotation translation", "", ""),
-    "network/alignment": ("rotation translation", "reference ambiguity", "n_poses"),
+    "network/alignment": ("rotation translation", "reference ambiguity", "residual n_poses"),
     "network/initial": ("source target fmap_initial", "", ""),
     "network": ("source target fmap_initial fmap weight cycle_error", "", ""),
     "latent": (
@@ -379,7 +406,7 @@ HOLDS = {
         "",
         "",
     ),
-    "iterations": ("shape fmap latent_basis latent_eigenvalue", "", ""),
+    "iterations": ("shape source target fmap latent_basis latent_eigenvalue", "", ""),
     "registration": ("position corner_vertex vertex_area", "template", ""),
     "registration/shape": (
         "registered_match displacement rotation translation scale confidence template_triangle "
@@ -400,7 +427,8 @@ HOLDS = {
         "",
     ),
 }
-TEXTS = set("source target status reason warning path shape stage".split())
+OMITTED = ("shape", "pair", "iteration")  # leading dims that a file of one of them lacks
+TEXTS = set("source target status reason warning path coordinate_system shape stage".split())
 
 
 def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr.Variable:
@@ -435,7 +463,7 @@ def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr
         raise ValueError(f"no variable {name!r} in the schema; add it to s4a.schema.TABLE first")
     dims, unit, long_name = TABLE[name]
     data = np.asarray(data)
-    if data.ndim == len(dims) - 1 and dims[0] in ("shape", "pair"):
+    if data.ndim == len(dims) - 1 and dims[0] in OMITTED:
         dims = dims[1:]
     if data.ndim != len(dims):
         raise ValueError(f"{name} needs the dims {dims}, found an array of shape {data.shape}")

@@ -142,6 +142,10 @@ def seeds():
         vertex["x"], face["n"], face["v"] = X, 3, T
         return head.encode() + vertex.tobytes() + face.tobytes()
 
+    mz3 = b"MZ" + np.array([3], "<u2").tobytes() + np.array([len(T), len(X), 0], "<u4").tobytes()
+    mz3 += T.astype("<i4").tobytes() + X.astype("<f4").tobytes()
+    ends = " ".join(str(3 * i + 3) for i in range(len(T)))
+
     def vtk(kind, cells):
         return f"# vtk DataFile Version 3.0\na\n{kind}\nDATASET POLYDATA\n{cells}"
 
@@ -171,6 +175,8 @@ def seeds():
         + "vt 0 0\n"
         + "".join(f"f {a}/1 {b}//2 {c}/1/1\n" for a, b, c in T[:-2] + 1)
     )
+    mni = f"P 0.3 0.3 0.4 10 1 {len(X)}\n{numbers}\n\n{numbers}\n\n {len(T)}\n 0 1 1 1 1\n\n"
+    mni += f"{ends}\n\n{flat}\n"
     obj += "".join(f"f {a} {b} {c}\n" for a, b, c in T[-2:] - len(X))
 
     def vtp(how, compressed=False, size="u4"):
@@ -305,6 +311,8 @@ def seeds():
         "GIFTI": (".gii", "mesh", [*(gifti(how, *geometry) for how in encodings), (raw, in_gifti)]),
         "FreeSurfer": (".pial", "mesh", [freesurfer]),
         "NPZ": (".npz", "mesh", npzs),
+        "MZ3": (".mz3", "mesh", [mz3]),
+        "MNI": (".obj", "mesh", [mni.encode()]),
         "gzip": (".gz", "mesh", [zipped(off), (ply(orders[1]), zipped), (text, zipped)]),
         "GIFTI labels": (".gii", "labels", [gifti(how, *marked) for how in encodings]),
         "annot": (".annot", "labels", [annot, old, (annot, zipped)]),

@@ -17,8 +17,8 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from s4a.analysis.inputs import Values, displacements_of, registration_of, values_of
-from s4a.analysis.permutation import Model, check_permutations
+from s4a.analysis.inputs import Values, displacements_of, labels_of, registration_of
+from s4a.analysis.permutation import Model, check_count
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.closest import closest_facing_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, edges, vertex_areas, vertex_normals
@@ -231,7 +231,7 @@ def asymmetry(
     (('vertex', 'xyz'), 1.0)
     """
     seed = seed_of(seed, rng)
-    check_permutations(n_permutations)
+    check_count(n_permutations)
     if of not in ("vector", "normal"):
         raise ValueError(f"of must be 'vector' or 'normal', found {of!r}")
     if (subject is None) != (side is None):
@@ -267,9 +267,9 @@ def paired(
 ) -> tuple[list[str], list[int], list[int], list[str], str]:
     """Return subjects with both sides, indices of their shapes, shapes left out, and a label."""
     shapes = registration["shape"].values.tolist()
-    subjects = [str(value).strip() for value in values_of(study, subject, "subject").tolist()]
-    sides = [str(value).strip() for value in values_of(study, side, "side").tolist()]
-    valid = [i for i in range(len(shapes)) if not {subjects[i], sides[i]} & {"", "nan"}]
+    subjects = labels_of(study, subject, "subject")
+    sides = labels_of(study, side, "side")
+    valid = [i for i in range(len(shapes)) if subjects[i] and sides[i]]
     two = sorted({sides[i] for i in valid})
     if len(two) != 2:
         raise ValueError(f"side needs two values, such as left and right; found {listed(two)}")

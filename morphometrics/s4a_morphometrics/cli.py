@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import s4a
 from s4a.cli import command
-from s4a.cli.commands import study_to_test, write
+from s4a.cli.commands import SYSTEM, study_to_test, write
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -103,7 +103,7 @@ def growth(
     subject : COLUMN
         subject of each shape
     covariates : COLUMN
-        covariates
+        covariates, separated by spaces or commas
     field : NAME
         name of a field of s4a fields, in place of shape
     of
@@ -159,7 +159,7 @@ def covariation(
     field : FIELD
         name of a field of s4a fields
     covariates : COLUMN
-        covariates
+        covariates, separated by spaces or commas
     table : PATH
         CSV with a column 'shape', in place of the table of the study
     include_flagged
@@ -233,6 +233,7 @@ def export(
     template_landmarks: str | None = None,
     labels: str | None = None,
     grid: str | None = None,
+    **system: Any,
 ) -> int:
     """Write a study for Slicer, ShapeWorks, Scalismo, ParaView, R, or as label volumes.
 
@@ -263,7 +264,7 @@ def export(
     marks = read(template_landmarks) if template_landmarks else None
     label = template_labels(tree, labels)
     asked = {"n_points": points, "n_modes": modes, "landmarks": marks, "label": label, "grid": grid}
-    options = {name: value for name, value in asked.items() if value is not None}
+    options = {name: value for name, value in {**asked, **system}.items() if value is not None}
     paths = write_for(tree, out, to, **options)
     write(f"{len(paths)} files for {to} in {out}, such as {paths[-1].name}")
     return 0
@@ -273,4 +274,4 @@ ASYMMETRY = command(asymmetry, ("seed",))
 GROWTH = command(growth, ("seed",))
 COVARIATION = command(covariation, ("seed",))
 COMPLETE = command(complete, ("seed",))
-EXPORT = command(export)
+EXPORT = command(export, SYSTEM)

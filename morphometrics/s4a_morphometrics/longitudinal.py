@@ -23,7 +23,7 @@ from s4a.analysis.effects import (
     squared_cohen_f,
     vertex_results,
 )
-from s4a.analysis.inputs import Values, registration_of, sample_of, values_of
+from s4a.analysis.inputs import Values, labels_of, registration_of, sample_of
 from s4a.analysis.model import count_components
 from s4a.analysis.permutation import Model, check_options, standardize
 from s4a.input.subjects import listed
@@ -306,10 +306,9 @@ def _with_subjects(study, sample, subject):
     """Return the sample of shapes with a subject, and the subject of each."""
     shapes = sample.registration["shape"].values
     names = registration_of(study)["shape"].values.tolist()
-    values = (str(value) for value in values_of(study, subject, "subject").tolist())
-    subject_of = dict(zip(names, values, strict=True))
+    subject_of = dict(zip(names, labels_of(study, subject, "subject"), strict=True))
     subjects = np.array([subject_of[shape] for shape in shapes.tolist()])
-    present = (subjects != "") & (subjects != "nan")
+    present = subjects != ""
     if not present.all():
         lacking = shapes[~present].tolist()
         log.warning("left out, because the subject is missing: %s", listed(lacking, most=9))

@@ -19,6 +19,7 @@ from s4a.analysis.inputs import (
 )
 from s4a.analysis.permutation import standardize
 from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.input.columns import check_column
 from s4a.input.subjects import listed
 from s4a.method.pca import gram, pca
 from s4a.schema import variable
@@ -197,6 +198,7 @@ def without(study: xr.DataTree, nuisance: Values | dict[str, Values] | list[str]
             raise ValueError(
                 f"a nuisance needs a value for every shape; {name} lacks {listed(lacking)}"
             )
+        check_column(values, registration["shape"].values.tolist(), name)
     Z, _ = columns_of(columns)
     if Z is None:
         raise ValueError("a nuisance needs a value for every shape, found none")

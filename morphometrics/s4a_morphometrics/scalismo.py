@@ -5,8 +5,8 @@ orthonormal over the 3 n coordinates.  Modes of S4A are orthonormal under the ve
 They are rotated when written: the Gaussian is unchanged, its components are those of equal weights.
 """
 
+import os
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -17,10 +17,11 @@ from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.input.raw import check_there, shown
 from s4a.method.pca import synthesize
 from s4a.schema import check_count, dataset, unit_of
+from s4a.study.netcdf import open_hdf5, stored_in, values_of
 
-LARGEST = 2**32  # bytes of an array of a model
 MODEL = ("model/mean", "model/pcaBasis", "model/pcaVariance")
 REPRESENTER = ("representer/points", "representer/cells")
+NOISE = "model/noiseVariance"
 
 
 def write_scalismo(
@@ -134,9 +135,9 @@ def read_scalismo(path: Path | str) -> xr.DataTree:
     """
     check_there(path)
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(os.path.realpath(path)) as file:
             mean, basis, variance, X, T = (_array(file, name) for name in MODEL + REPRESENTER)
-            noise = _array(file, "model/noiseVariance") if "model/noiseVariance" in file else [0.0]
+            noise = _array(file, NOISE) if file.links.exists(NOISE.encode()) else [0.0]
             is_scaled = _version(file) == (0, 8)  # columns have the length of one deviation
     except Exception as error:  # the message must name the file
         raise ValueError(
@@ -168,16 +169,13 @@ def read_scalismo(path: Path | str) -> xr.DataTree:
     return xr.DataTree.from_dict({"/registration": registration, "/pca": modes})
 
 
-def _array(file: h5py.File, name: str) -> Any:
+def _array(file: h5py.h5f.FileID, name: str) -> np.ndarray:
     """Return the numbers of a dataset stored in the file itself."""
-    if file.get(name, getclass=True, getlink=True) is not h5py.HardLink:
-        raise ValueError(f"{name} needed, found {', '.join(file) or 'nothing'}")
-    stored = file[name]
-    if not isinstance(stored, h5py.Dataset) or stored.external or stored.is_virtual:
-        raise ValueError(f"{name} needs to be an array within the file")
-    if stored.dtype.kind not in "fiu" or stored.nbytes > LARGEST:
-        raise ValueError(f"{name} needs numbers of at most {LARGEST} bytes, found {stored.dtype}")
-    values = stored[()]
+    try:
+        values = values_of(file, name)
+    except KeyError as error:
+        found = ", ".join(key.decode() for key in file)
+        raise ValueError(f"{name} needed, found {found or 'nothing'}") from error
     if not np.isfinite(values).all():
         raise ValueError(f"{name} needs finite numbers")
     return values
@@ -185,9 +183,9 @@ def _array(file: h5py.File, name: str) -> Any:
 
 def _version(file):
     """Return major and minor version; the first statismo files have only a name."""
-    if "version/majorVersion" in file:
+    if file.links.exists(b"version"):
         return tuple(int(_array(file, f"version/{part}Version")) for part in ("major", "minor"))
-    name = file["representer"].attrs.get("name", "")
+    name = h5py.Group(stored_in(file, "representer")).attrs.get("name", "")
     if name in ("vtkPolyDataRepresenter", "itkMeshRepresenter"):
         return (0, 8)
     raise ValueError("version/majorVersion needed, found none")

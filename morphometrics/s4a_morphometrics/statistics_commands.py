@@ -74,7 +74,7 @@ def field_statistics(
     regress_on : COLUMN
         regression of the field on a number, such as age
     covariates : COLUMN
-        covariates of both
+        covariates of both, separated by spaces or commas
     table : PATH
         CSV with a column 'shape', instead of the table of the study
     variances
@@ -151,7 +151,7 @@ def region_statistics(
     regress_on : COLUMN
         regression of shape on a number, such as age; its animation
     covariates : COLUMN
-        covariates of both
+        covariates of both, separated by spaces or commas
     table : PATH
         CSV with a column 'shape', instead of the table of the study
     variances

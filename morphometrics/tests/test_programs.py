@@ -163,7 +163,7 @@ def test_invalid_models_are_refused_with_the_missing_part(study, tmp_path):
     n = study["registration"].sizes["vertex"]
     for file, words in {
         cut: rf"cut\.h5 .* points \(3, n\).* found \(3, {n}\), .*\({3 * n - 3},\)",
-        other: "other.h5 cannot be read as a statistical shape model: model/mean needed",
+        other: "other.h5 cannot be read as a statistical shape model: model/mean is a link",
         tmp_path / "text.h5": "text.h5 cannot be read as a statistical shape model",
         tmp_path / "none.h5": "no file .*none.h5",
     }.items():

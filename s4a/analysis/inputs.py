@@ -1,5 +1,6 @@
 """Inputs of statistics (6.1): the registration of a study, and one value per shape."""
 
+import itertools
 import logging
 import re
 from collections.abc import Sequence
@@ -7,9 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
-from s4a.analysis.permutation import indicators, standardize
+from s4a.analysis.permutation import INFLATED, indicators, inflation, standardize
 from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.input.columns import check_column
 from s4a.input.subjects import (
     is_missing,
     is_plain_number,
@@ -18,7 +21,7 @@ from s4a.input.subjects import (
     non_numeric_text,
 )
 from s4a.method.pca import pca_without
-from s4a.options import Options, with_options
+from s4a.options import Options, kept_options, with_options
 from s4a.schema import check_type, require, unit_of
 from s4a.study.tree import left_out
 
@@ -90,6 +93,9 @@ def sample_of(
     if not complete.all():
         registration, d = registration.isel(shape=complete), d[complete]
     columns = {name: data[complete] for name, data in columns.items()}
+    for name, data in columns.items():
+        categories = name == tested and what == "group"
+        check_column(data, names[complete].tolist(), name, categories=categories)
     tested_values = columns.pop(tested)
     Z, attributes["covariates"] = columns_of(columns)
     unit = unit_of(registration["displacement"])
@@ -158,11 +164,10 @@ def with_flagged(study: xr.DataTree) -> xr.DataTree:
     check_type(study, xr.DataTree)
     nodes = {node.path: node.to_dataset(inherit=False) for node in study.subtree}
     if "report" in study.children:
-        nodes["/report"] = nodes["/report"].assign_attrs(
-            with_options(
-                nodes["/report"].attrs, {"include_flagged": True, "quality_control": "exclude"}
-            )
-        )
+        attrs = nodes["/report"].attrs
+        is_stop = kept_options(study).get("quality_control") == "stop"
+        given = {"include_flagged": True} | ({"quality_control": "exclude"} if is_stop else {})
+        nodes["/report"] = nodes["/report"].assign_attrs(with_options(attrs, given))
     registration = all_registered(study)
     template = registration.attrs.get("template", "")
     coarse = nodes.get(f"/coarse/{template}")
@@ -225,6 +230,16 @@ def values_of(study: xr.DataTree, values: Values, what: str) -> np.ndarray:
             f"{what} needs one value for each of {len(names)} shapes; found shape {values.shape}"
         )
     return _plain(values, names, what)
+
+
+def labels_of(study: xr.DataTree, values: Values, what: str) -> list[str]:
+    """Return a subject, side or other label of each shape as text, empty if it is missing."""
+    names = registration_of(study)["shape"].values.tolist()
+    found = values_of(study, values, what)
+    present = ~lacks_value(found)
+    kept = [name for name, one in zip(names, present, strict=True) if one]
+    check_column(found[present], kept, what, categories=True)
+    return [str(x) if one else "" for x, one in zip(found.tolist(), present, strict=True)]
 
 
 def _in_order(values, names, what):
@@ -349,7 +364,9 @@ def covariates_of(
         covariates = [covariates]
     is_names = isinstance(covariates, list) and all(isinstance(name, str) for name in covariates)
     if is_names:
-        covariates = {name: name for name in covariates}
+        table = study["subjects"] if "subjects" in study.children else ()
+        words = [[word] if word in table else word.split(",") for word in covariates]
+        covariates = {name: name for name in map(str.strip, itertools.chain(*words)) if name}
     elif not isinstance(covariates, dict) or shapes <= set(covariates):
         covariates = {"": covariates}
     columns = {}
@@ -362,7 +379,7 @@ def covariates_of(
 def columns_of(covariates: dict[str, np.ndarray]) -> tuple[np.ndarray | None, str]:
     """Return covariates as columns of numbers ``(s, c)``, text as indicators, and in words.
 
-    Warns about columns that are constant, a combination of others, or a numbering of the shapes.
+    Warns about columns that are constant, nearly a combination of others, or number the shapes.
 
     Examples
     --------
@@ -390,7 +407,8 @@ def columns_of(covariates: dict[str, np.ndarray]) -> tuple[np.ndarray | None, st
             words.append(f"{name}, {numbers.shape[1]} columns" if several else name)
         columns.append(numbers)
     Z = np.column_stack(columns)
-    for line in redundant(Z, names):
+    terms = np.repeat(np.arange(len(columns)), [column.shape[1] for column in columns])
+    for line in redundant(Z, names, terms):
         log.warning("%s", line)
     for name, values in zip(names, Z.T, strict=True):
         if numbers_shapes(name, values):
@@ -437,8 +455,10 @@ def _indicators_of(values, name):
     return groups.tolist(), numbers
 
 
-def redundant(Z: np.ndarray, names: list[str]) -> list[str]:
+def redundant(Z: np.ndarray, names: list[str], terms: ArrayLike | None = None) -> list[str]:
     """List the columns ``(s, c)`` that are constant or combinations of earlier ones, in words.
+
+    Columns of one term ``(c,)``, such as indicators of the same groups, may be correlated.
 
     Examples
     --------
@@ -447,20 +467,32 @@ def redundant(Z: np.ndarray, names: list[str]) -> list[str]:
     >>> Z = np.array([[1.0, 2, 5], [2, 5, 5], [4, 9, 5], [3, 7, 5]])
     >>> for line in redundant(np.column_stack([Z, Z[:, 0] - Z[:, 1]]), ["a", "b", "c", "d"]):
     ...     print(line)
+    b is nearly a linear combination of a (variance inflation factor 59): omit one of them
     c is constant and changes nothing
     d is a linear combination of a, b and changes nothing
     """
     columns, rounding = standardize(Z)
+    terms = np.arange(len(names)) if terms is None else np.asarray(terms)
     independent: list[int] = []
     lines = []
     for i, name in enumerate(names):
-        before = columns[:, independent]
-        weight = np.linalg.lstsq(before, columns[:, i], rcond=None)[0]
         if not columns[:, i].any():
             lines.append(f"{name} is constant and changes nothing")
-        elif np.linalg.norm(columns[:, i] - before @ weight) <= max(1e-8, rounding):
+            continue
+        before = columns[:, independent]
+        weight = np.linalg.lstsq(before, columns[:, i], rcond=None)[0]
+        if np.linalg.norm(columns[:, i] - before @ weight) <= max(1e-8, rounding):
             others = [names[k] for k, w in zip(independent, weight, strict=True) if abs(w) > 1e-6]
             lines.append(f"{name} is a linear combination of {listed(others)} and changes nothing")
-        else:
-            independent.append(i)
+            continue
+        other_terms = [k for k in independent if terms[k] != terms[i]]
+        basis = np.linalg.qr(columns[:, other_terms])[0]
+        factor = inflation(columns[:, [i]], basis, len(other_terms))
+        if factor > INFLATED:
+            others = [names[k] for k in other_terms]
+            lines.append(
+                f"{name} is nearly a linear combination of {listed(others)} "
+                f"(variance inflation factor {factor:.2g}): omit one of them"
+            )
+        independent.append(i)
     return lines

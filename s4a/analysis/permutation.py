@@ -22,18 +22,20 @@ from scipy import stats
 log = logging.getLogger(__name__)
 
 MOST_PERMUTATIONS = 10_000_000
+# variance inflation factors from which covariates are reported, and a variable cannot be tested
+INFLATED, MOST_INFLATED = 10.0, 1e4
 VARIANCES = ("equal", "unequal")
 
 
-def check_permutations(n: int) -> None:
-    """Raise ValueError unless the number of permutations is in range."""
-    if not 1 <= n <= MOST_PERMUTATIONS:
-        raise ValueError(f"n_permutations needs a number from 1 to {MOST_PERMUTATIONS}; found {n}")
+def check_count(n: int, name: str = "n_permutations", least: int = 1) -> None:
+    """Raise ValueError unless a number, of permutations by default, is in range."""
+    if not least <= n <= MOST_PERMUTATIONS:
+        raise ValueError(f"{name} needs a number from {least} to {MOST_PERMUTATIONS}; found {n}")
 
 
 def check_options(n_permutations: int, variances: str, seed: int) -> dict[str, Any]:
     """Return the options of a :class:`Model` after a check."""
-    check_permutations(n_permutations)
+    check_count(n_permutations)
     if variances not in VARIANCES:
         raise ValueError(f"variances must be 'equal' or 'unequal'; found {variances!r}")
     return {"n_permutations": n_permutations, "variances": variances, "seed": seed}
@@ -95,9 +97,37 @@ def design(x: np.ndarray, covariates: np.ndarray | None = None) -> tuple[np.ndar
             f"{n} shapes are too few for a model of {r + q} columns (mean, {r - 1} covariates, "
             f"{q} tested): use {r + q + 2} shapes or fewer covariates"
         )
-    if q < np.linalg.matrix_rank(X):
-        raise ValueError("the tested variable is a combination of the covariates; omit one of them")
+    factor = inflation(X, Z)
+    if q < np.linalg.matrix_rank(X) or factor > MOST_INFLATED:
+        nearly = "" if factor > 1e12 else f" up to a variance inflation factor of {factor:.2g}"
+        raise ValueError(
+            f"the tested variable is a combination of the covariates{nearly}; omit one of them"
+        )
     return Z, Q
+
+
+def inflation(X: np.ndarray, Z: np.ndarray, n_parameters: int = 0) -> float:
+    """Return the variance inflation factor of columns, the largest one.
+
+    Parameters
+    ----------
+    X : float ndarray (n, q)
+        Columns of length 1, or 0, see :func:`standardize`.
+    Z : float ndarray (n, r)
+        Orthonormal basis of other columns.
+    n_parameters : int
+        Number of the other columns, to adjust the explained shares of the variance for it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.permutation import inflation
+    >>> round(inflation(np.array([[0.6], [0.8]]), np.array([[0.0], [1.0]])), 2)
+    2.78
+    """
+    share = ((X - Z @ (Z.T @ X)) ** 2).sum(0)[X.any(0)].min(initial=1.0)
+    n = len(X) - 1
+    return float((n - n_parameters) / n / max(share, 1e-30))
 
 
 def indicators(group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -256,8 +286,20 @@ class Model:
         return math.prod(math.factorial(sizes.count(s)) for s in set(sizes))  # exchanged groups
 
     def attributes(self) -> dict[str, str | int | float]:
-        """Return the attributes of a result; warn if no p value below 0.05 is possible."""
+        """Return the attributes of a result; warn if the test has little power.
+
+        Either no p value below 0.05 is possible, or the covariates explain the tested variable.
+        """
         least = self.smallest_p
+        Z, X = self.bases[0], standardize(np.reshape(self.x, (len(self.x), -1)))[0]
+        factor = inflation(X, Z, Z.shape[1] - 1) if self.covariates is not None else 1.0
+        if factor > INFLATED:
+            log.warning(
+                "the covariates explain most of the tested variable (variance inflation factor "
+                "%.2g): effects of the two cannot be told apart; omit covariates that measure the "
+                "same",
+                factor,
+            )
         if least > 0.05:
             subjects = "" if self.blocks is None else f" of {len(self.block_rows)} subjects"
             log.warning(

@@ -6,14 +6,20 @@ eigenvector of the matrix of comparisons, so that no single shape decides.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from s4a.input.columns import check_column
+from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved, transformed
 from s4a.input.subjects import listed
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
 COMMON_SIDE, OTHER_SIDE = 0.8, 0.5  # least |mean chirality|: median of all shapes, of one shape
+# largest ICP residual of a mirror image, as a share of that of the shape: 0.7 to 0.8 for femurs of
+# the other side, 0.88 or more for nearly symmetric faces with meshes of their own
+CLEARLY = 0.85
 AUTO = "auto"
 PLURAL = ("they are", "them", "all that are")
 YES, NO = ("1", "1.0", "true", "yes"), ("0", "0.0", "false", "no")
@@ -36,23 +42,22 @@ def mirror_image(mesh: xr.Dataset) -> xr.Dataset:
     >>> abs(volume(*as_arrays(image)) - volume(*as_arrays(mesh))) < 1e-9
     True
     """
-    image = mesh.copy()
-    for name in ("position", "landmark_position", "guide_position"):
-        if name in mesh:
-            image[name] = mesh[name].copy(data=mesh[name].values * MIRROR)
-    for name in ("landmark_barycentric", "guide_barycentric"):
-        if name in mesh:
-            image[name] = mesh[name].copy(data=mesh[name].values[:, ::-1])
-    flipped = np.ascontiguousarray(mesh["corner_vertex"].values[:, ::-1])
-    image["corner_vertex"] = mesh["corner_vertex"].copy(data=flipped)
+    image = transformed(mesh, np.diag([*MIRROR, 1.0]))
     reasons = [mesh.attrs.get("reason", ""), "mirrored by reflect="]
     reflected = 1 - mesh.attrs.get("reflected", 0)
     return image.assign_attrs(reflected=reflected, reason="; ".join(filter(None, reasons)))
 
 
-def in_file(mesh: xr.Dataset, X: np.ndarray) -> np.ndarray:
-    """Transform points ``(n, 3)`` of a mesh to the frame of its file, or back."""
-    return X * MIRROR if mesh.attrs.get("reflected") else X
+def map_to_file(attrs: Mapping[Any, Any]) -> np.ndarray:
+    """Return the map (4, 4) of a mesh with these attributes to the coordinates of its file."""
+    M = np.diag([*MIRROR, 1.0]) if attrs.get("reflected") else np.eye(4)
+    return map_between(CoordinateSystem.of(attrs), file_system(attrs), "a mesh") @ M
+
+
+def in_file(mesh: xr.Dataset, X: np.ndarray, *, back: bool = False) -> np.ndarray:
+    """Transform points ``(n, 3)`` of a mesh to the coordinates of its file, or back."""
+    M = map_to_file(mesh.attrs)
+    return moved(X, np.linalg.inv(M) if back else M)
 
 
 def mean_chirality(comparisons: Mapping[str, xr.Dataset]) -> np.ndarray:
@@ -116,6 +121,44 @@ def _mean(chirality):
     return np.where(is_known, chirality, 0).sum(1) / np.maximum(is_known.sum(1), 1)
 
 
+def fits_mirrored(
+    comparisons: Mapping[str, xr.Dataset], mirrored: Sequence[str]
+) -> dict[str, tuple[float, float]]:
+    """Median ICP residuals of `mirrored` shapes to references of the common side.
+
+    Returns
+    -------
+    dict of str to tuple (fit, fit_mirrored)
+        Residuals of the shape as it is and reflected.  Only if the latter is below ``CLEARLY``
+        times the former is the side clear: symmetric shapes differ from their mirror images by less
+        than two meshes of one shape do.
+    """
+    fits = {}
+    for name in mirrored:
+        data = comparisons[name]
+        common = ~np.isin(data["reference"].values, mirrored)
+        common |= not common.any()
+        fit, fit_mirrored = (
+            float(np.nanmedian(data[key].values[common])) for key in ("fit", "fit_mirrored")
+        )
+        fits[name] = fit, fit_mirrored
+    return fits
+
+
+def clearly_mirrored(comparisons: Mapping[str, xr.Dataset], names: Sequence[str]) -> list[str]:
+    """Return those of the `names` that fit the common side clearly better if they are reflected."""
+    fits = fits_mirrored(comparisons, names)
+    return [name for name in names if fits[name][1] < CLEARLY * fits[name][0]]
+
+
+def _unclear(weak):
+    they, them, which = ("it is", "it", "it if it is") if len(weak) == 1 else PLURAL
+    return (
+        f"reflect='auto' cannot determine the side of {listed(weak, most=20)}, left as {they}: "
+        f"look at {them}, and name {which} to be mirrored"
+    )
+
+
 def mirrored_shapes(comparisons: Mapping[str, xr.Dataset]) -> tuple[list[str], list[str]]:
     """Return the shapes that ``reflect="auto"`` mirrors, those of the less common side.
 
@@ -128,7 +171,12 @@ def mirrored_shapes(comparisons: Mapping[str, xr.Dataset]) -> tuple[list[str], l
     """
     if len(comparisons) < 2:
         return [], ["reflect='auto' needs at least two shapes to compare"]
-    return rarer_side(dict(zip(comparisons, mean_chirality(comparisons).tolist(), strict=True)))
+    names, remarks = rarer_side(
+        dict(zip(comparisons, mean_chirality(comparisons).tolist(), strict=True))
+    )
+    clear = clearly_mirrored(comparisons, names)
+    unclear = [name for name in names if name not in clear]
+    return clear, [*remarks, *([_unclear(unclear)] if unclear else [])]
 
 
 def rarer_side(chirality: Mapping[str, float]) -> tuple[list[str], list[str]]:
@@ -141,13 +189,8 @@ def rarer_side(chirality: Mapping[str, float]) -> tuple[list[str], list[str]]:
             "to mirror"
         ]
     weak = [name for name, value in chirality.items() if abs(value) < OTHER_SIDE]
-    they, them, which = ("it is", "it", "it if it is") if len(weak) == 1 else PLURAL
-    remark = (
-        f"reflect='auto' cannot determine the side of {listed(weak, most=20)}, left as {they}: "
-        f"look at {them}, and name {which} to be mirrored"
-    )
     mirrored = [name for name, value in chirality.items() if value <= -OTHER_SIDE]
-    return mirrored, [remark] * bool(weak)
+    return mirrored, [_unclear(weak)] * bool(weak)
 
 
 def is_mirrored(
@@ -171,11 +214,9 @@ def is_mirrored(
             f"distinguish left and right (median |mean_chirality| {median:.2f}, {COMMON_SIDE} "
             "needed)"
         )
-    if abs(this) < OTHER_SIDE:
-        return False, (
-            f"reflect='auto' cannot determine the side of {name}, left as it is: look at it, "
-            "and name it if it is to be mirrored"
-        )
+    is_clear = this > 0 or clearly_mirrored({name: comparison}, [name])
+    if abs(this) < OTHER_SIDE or not is_clear:
+        return False, _unclear([name])
     return bool(this <= -OTHER_SIDE), ""
 
 
@@ -236,6 +277,8 @@ def _rows_of(table, column, value):
     if missing:
         raise ValueError(f"reflect: the column {column!r} has no value for {listed(missing)}")
     if value is not None:
+        cells = np.array(list(words.values()))
+        check_column(cells, list(words), f"reflect, column {column!r}", categories=True)
         if value not in words.values():
             raise ValueError(
                 f"reflect: no shape has {value!r} in the column {column!r}, which has "

@@ -1,5 +1,6 @@
 """Mesh files: read and write triangle meshes, and find the files of a collection (5, the data)."""
 
+import contextlib
 import fnmatch
 import glob
 import hashlib
@@ -8,20 +9,25 @@ import re
 import unicodedata
 import zipfile
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from s4a.input.coordinates import CoordinateSystem, map_between, moved, system_in
 from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
-from s4a.input.labels import VOLUMES, is_volume
+from s4a.input.labels import VOLUMES, grid_of, volume_format
+from s4a.input.polygons import triangulated
 from s4a.input.raw import check_there, content, regular_file, shown
 
 SUFFIXES = {suffix: name for name, kind in FORMATS.items() for suffix in kind.suffixes.split()}
+SUFFIXES[".obj"] = "OBJ"  # and of MNI
 WRITERS = {kind.suffixes.split()[0]: kind.write for kind in FORMATS.values() if kind.write}
 LONGEST_NAME = 100  # characters of a shape's name, as files of a study are named after it
 OTHERS = ".json .csv .txt .md .html .png .jpg .nc .npy .annot .nii".split()  # not meshes
+# grapheme joiner, variation selectors, fillers of Hangul and the blank of Braille
+_UNSEEN = re.compile("[\u034f\ufe00-\ufe0f\u115f\u1160\u3164\uffa0\u2800]")
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -32,10 +38,10 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
     Parameters
     ----------
     path : str or Path
-        PLY, OBJ, OFF, STL, VTK legacy polydata, VTP, GIFTI, FreeSurfer surface, or NPZ with the
-        keys V and F, vertices and faces, points and triangles, position and corner_vertex, or X and
-        T.  Files may be compressed by gzip (.ply.gz).  The limit is 2 GiB, or 1 GiB unpacked.
-        Polygons are split into triangles.
+        PLY, OBJ (also of MNI), OFF, STL, VTK legacy polydata, VTP, GIFTI, FreeSurfer surface, MZ3,
+        or NPZ with the keys V and F, vertices and faces, points and triangles, position and
+        corner_vertex, or X and T.  Files may be compressed by gzip (.ply.gz).  The limit is 2 GiB,
+        or 1 GiB unpacked.  Polygons are split into triangles.
 
     Returns
     -------
@@ -43,8 +49,8 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
         As in the file, including non-finite ones; for STL, the distinct corners.
     triangles : int32 ndarray (m, 3)
     attrs : dict of str
-        ``format``; ``coordinate_system`` (RAS or LPS) and ``unit`` if the file has them; ``note``
-        if the suffix is that of another format.
+        ``format``; ``coordinate_system`` and ``unit`` if the file has them
+        (:mod:`s4a.input.coordinates`); ``note`` if the suffix is that of another format.
 
     Raises
     ------
@@ -72,22 +78,41 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
     name = "mesh"
     try:
         data = content(path).removeprefix(b"\xef\xbb\xbf")
-        if is_volume(data):
-            raise ValueError("found a volume; give a label (label=17, --label 17) for its surface")
+        if volume := volume_format(data):
+            raise ValueError(
+                f"found a volume ({volume}); give a label (label=17, --label 17) for its surface"
+            )
         name = format_of(data)
         with np.errstate(all="ignore"):  # invalid numbers are an error here or cleaned later
-            points, triangles, attrs = FORMATS[name].read(data)
-            points, triangles = _checked(points, triangles)
+            points, cells, attrs = FORMATS[name].read(data)
+            points, triangles, n_crossing = _checked(points, cells)
+            attrs, notes = {"format": name, **attrs, **system_in(data, name).attrs}, []
     except Exception as error:  # no file may end the run over a collection
         why = shown(error) or type(error).__name__
         raise ValueError(f"{shown(path)} cannot be read as {name}: {why}") from error
-    attrs = {"format": name, **attrs}
-    space = re.search(rb"SPACE=(RAS|LPS)", data[:1000])  # 3D Slicer writes this into any header
-    if space:
-        attrs["coordinate_system"] = space[1].decode()
-    if SUFFIXES.get(suffix_of(path), name) != name:
-        attrs["note"] = f"named {path.suffix} but read as {name} by its content; rename the file"
-    return points, triangles, attrs
+    suffix = suffix_of(path)
+    if suffix in SUFFIXES and suffix not in FORMATS[name].suffixes.split():
+        notes.append(f"named {path.suffix} but read as {name} by its content; rename the file")
+    if n_crossing:
+        notes.append(f"{n_crossing} polygons intersect themselves; save the surface as triangles")
+    return points, triangles, attrs | ({"note": "; ".join(notes)} if notes else {})
+
+
+def systems_of(shapes: Mapping[str, Any], given: CoordinateSystem) -> dict[str, CoordinateSystem]:
+    """Return the coordinate systems of files and meshes by name, without unreadable files.
+
+    `given` says what they leave open.
+    """
+    systems = {}
+    for name, shape in shapes.items():
+        if not isinstance(shape, str | os.PathLike):
+            systems[name] = CoordinateSystem.of(getattr(shape, "attrs", {})).filled(given)
+            continue
+        with contextlib.suppress(Exception):  # reading the shape will raise the error
+            data = content(Path(shape)).removeprefix(b"\xef\xbb\xbf")
+            own = grid_of(data)[2] if volume_format(data) else system_in(data, format_of(data))
+            systems[name] = own.filled(given)
+    return systems
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str:
@@ -116,28 +141,40 @@ def stem_of(path: str | os.PathLike[str]) -> str:
     return name if suffix_of(path) in SURFER.split() else Path(name).stem
 
 
-def _checked(points, triangles):
-    """Convert points to float64 and triangles to int32, or ValueError."""
-    points, triangles = np.asarray(points, np.float64), np.asarray(triangles, np.int64)
-    if points.ndim != 2 or points.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
+def _checked(points, cells):
+    """Points (float64), triangles (int32) and number of crossing polygons, or ValueError.
+
+    `cells` are triangles ``(m, 3)`` or polygons, see :mod:`s4a.input.polygons`.
+    """
+    points = np.asarray(points, np.float64)
+    corners, *sizes = cells if isinstance(cells, tuple) else [np.asarray(cells)]
+    n, m = len(points), len(sizes[0] if sizes else corners)
+    fits = bool(sizes) or (corners.ndim == 2 and corners.shape[1] == 3)
+    if points.ndim != 2 or points.shape[1] != 3 or not fits:
         raise ValueError(
-            f"points (n, 3) and triangles (m, 3) needed, found {points.shape} and {triangles.shape}"
+            f"points (n, 3) and triangles (m, 3) needed, found {points.shape} and {corners.shape}"
         )
-    n, m = len(points), len(triangles)
-    if n and m == 0:
+    if n and corners.size == 0:
         raise ValueError(f"no faces: a surface needs triangles, found {n} points only")
     if n == 0:
         raise ValueError(f"a surface needs vertices and triangles, found 0 and {m}")
-    low, high = triangles.min(), triangles.max()
+    corners = corners.astype(np.int64)
+    low, high = corners.min(), corners.max()
     if low < 0 or high >= n:
         raise ValueError(f"face indices 0..{n - 1} expected for {n} vertices, found {low}..{high}")
-    return points, triangles.astype(np.int32)
+    triangles, n_crossing = triangulated(points, corners, *sizes) if sizes else (corners, 0)
+    if len(triangles) == 0:
+        raise ValueError(f"no faces: polygons of three corners or more needed, found {m} of fewer")
+    return points, triangles.astype(np.int32), n_crossing
 
 
 def write_mesh(
     path: str | os.PathLike[str],
     points: np.ndarray,
     triangles: np.ndarray,
+    *,
+    coordinate_system: str = "",
+    unit: str = "",
     **vertex_scalars: np.ndarray,
 ) -> None:
     """Write a mesh file in the format of its suffix.
@@ -148,6 +185,9 @@ def write_mesh(
         Name ending in .ply (binary), .obj, .off, .stl, .vtk, .vtp, .gii or .npz.
     points : float ndarray (n, 3)
     triangles : int ndarray (m, 3)
+    coordinate_system, unit : str, optional
+        Written into the header, as 3D Slicer does, but for NPZ.  Coordinates in FreeSurfer's
+        surface RAS are converted to scanner RAS, and those of GIFTI to RAS and mm.
     **vertex_scalars : float ndarray (n,)
         Values per vertex by name, in PLY, VTK, VTP, GIFTI (float32) and NPZ.
 
@@ -173,7 +213,7 @@ def write_mesh(
     True
     """
     path = Path(path)
-    points, triangles = _checked(points, triangles)
+    points, triangles, _ = _checked(points, triangles)
     scalars = {name: np.asarray(values) for name, values in vertex_scalars.items()}
     for name, values in scalars.items():
         if values.shape != (len(points),):
@@ -187,7 +227,11 @@ def write_mesh(
         raise ValueError(
             f"{suffix} cannot hold values per vertex; write .ply, .vtk, .vtp, .gii or .npz"
         )
-    path.write_bytes(WRITERS[suffix](points, triangles, scalars))
+    system = CoordinateSystem.of({"coordinate_system": coordinate_system, "unit": unit})
+    written = system.in_world(*["RAS", "mm"] if suffix == ".gii" else [])
+    M = map_between(system, written, shown(path))
+    triangles = triangles[:, ::-1] if np.linalg.det(M) < 0 else triangles
+    path.write_bytes(WRITERS[suffix](moved(points, M), triangles, scalars, written.title))
 
 
 # the files of a collection
@@ -374,6 +418,17 @@ def _plain(text):
 
 def _digest(text):
     return hashlib.sha256(os.fsencode(text)).hexdigest()[:8]
+
+
+def visible(text: str) -> str:
+    """Return a text in composed letters, without characters that cannot be seen."""
+    text = unicodedata.normalize("NFC", text)
+    kept = (
+        c
+        for c in text
+        if c.isspace() or not (unicodedata.category(c) in ("Cf", "Cc") or _UNSEEN.match(c))
+    )
+    return " ".join("".join(kept).split())
 
 
 def check_names(names: Iterable[Any]) -> None:

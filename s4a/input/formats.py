@@ -6,8 +6,8 @@ How to add a format:
    ValueError, with what was expected and found, for invalid data, and allocate memory only if the
    file is long enough for its counts (:func:`_need`, :mod:`s4a.input.raw`).
    :func:`s4a.input.files.read_mesh` checks shapes and indices and adds the name of the file;
-   :func:`s4a.input.formats.fans` converts polygons to triangles.
-2. To write the format too, write ``_x_bytes(X, T, scalars)``.
+   :func:`s4a.input.polygons.triangulated` converts polygons, ``(corners, sizes)``, to triangles.
+2. To write the format too, write ``_x_bytes(X, T, scalars, title)``.
 3. Add both to :data:`FORMATS` at the end of this file, with suffixes and signature.
 4. Add a valid file to ``seeds`` of ``tests/fuzz.py``, which damages it in thousands of ways.
 
@@ -23,15 +23,18 @@ import base64
 import io
 import math
 import re
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
+from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from s4a.geometry.mesh import equal_rows
-from s4a.input.raw import limit_of, npz, unpack, xml
+from s4a.input.polygons import Polygons, joined, polygons, strips
+from s4a.input.raw import is_utf_16, limit_of, npz, unpack, xml
 
 _LEGACY_TYPES = {
     "char": "i1", "unsigned_char": "u1", "short": "i2", "unsigned_short": "u2", "int": "i4",
@@ -39,35 +42,6 @@ _LEGACY_TYPES = {
     "vtktypeint64": "i8", "vtktypeint32": "i4", "float": "f4", "double": "f8",
 }  # fmt: skip
 _COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
-
-
-def fans(corners: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Triangulate polygons, given by their concatenated corners, into ``(m, 3)``.
-
-    Parameters
-    ----------
-    corners : int ndarray (c,)
-    offsets : int ndarray (p + 1,)
-        Polygon i has the corners ``offsets[i]`` to ``offsets[i + 1]``; fewer than three give no
-        triangle.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.input.formats import fans
-    >>> fans(np.array([0, 1, 2, 4, 5, 6, 7]), np.array([0, 3, 7])).tolist()
-    [[0, 1, 2], [4, 5, 6], [4, 6, 7]]
-    """
-    # 3---2   the first corner and each opposite side
-    # | / |
-    # 0---1
-    decreasing = (offsets[1:] < offsets[:-1]).any()  # not by differences, which may overflow
-    if decreasing or (len(offsets) and (offsets[0] < 0 or offsets[-1] > len(corners))):
-        raise ValueError(f"polygons of {offsets[-1]} corners expected, found {len(corners)}")
-    count = np.maximum(np.diff(offsets) - 2, 0)  # triangles of each polygon
-    first = np.repeat(offsets[:-1], count)
-    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    return corners[np.stack([first, first + step + 1, first + step + 2], axis=1)]
 
 
 def _number_type(name, order):
@@ -88,17 +62,17 @@ def _parse_vtk(data):
         raise ValueError(
             "DATASET POLYDATA expected, found another dataset; save the surface as polydata"
         )
-    points, triangles = None, [np.empty((0, 3), np.int64)]
+    points, cells = None, []
     while words := file.line():
         section = words[0].upper()
         if section == b"POINTS":
             points = file.values(3 * int(words[1]), words[2]).reshape(-1, 3)
-        elif section in (b"POLYGONS", b"LINES", b"VERTICES"):
-            cells = file.polygons(int(words[1]), int(words[2]))
-            if section == b"POLYGONS":
-                triangles.append(cells)
-        elif section == b"TRIANGLE_STRIPS":
-            raise ValueError("triangle strips are not supported; save the surface as triangles")
+        elif section in (b"POLYGONS", b"TRIANGLE_STRIPS", b"LINES", b"VERTICES"):
+            found = file.polygons(int(words[1]), int(words[2]))
+            if section == b"TRIANGLE_STRIPS":
+                found = strips(*found)
+            if section in (b"POLYGONS", b"TRIANGLE_STRIPS"):
+                cells.append(found)
         elif section in (b"POINT_DATA", b"CELL_DATA"):
             break
         elif section == b"METADATA":  # to the next empty line
@@ -109,7 +83,7 @@ def _parse_vtk(data):
             raise ValueError(f"a section of polydata expected, found {words[0][:40]!r}")
     if points is None:
         raise ValueError("POINTS expected, found none")
-    return points, np.concatenate(triangles), {}
+    return points, joined(cells), {}
 
 
 class _Legacy:
@@ -151,18 +125,18 @@ class _Legacy:
         return np.array(words[:count], dtype.newbyteorder("="))
 
     def polygons(self, n, size):
-        """Triangles of a section: count and corners of each cell, or offsets and corners (5.1)."""
+        """Cells of a section: count and corners of each cell, or offsets and corners (5.1)."""
         before = self.at
         words = self.line()
         if words and words[0].upper() == b"OFFSETS":
             offsets = self.values(n, words[1]).astype(np.int64)
             corners = self.values(size, self.line()[1])
-            return fans(corners.astype(np.int64), offsets)
+            return polygons(corners.astype(np.int64), offsets)
         self.at = before
         values = self.values(size, b"int").astype(np.int64)
         is_count = np.zeros(size, bool)
         is_count[_count_positions(values, n)] = True
-        return fans(values[~is_count], np.r_[0, np.cumsum(values[is_count])])
+        return values[~is_count], values[is_count]
 
     def skip_fields(self, count):
         """Skip arrays that come before the points."""
@@ -171,13 +145,13 @@ class _Legacy:
             n = int(width) * int(rows)
             if type_name.lower() != b"string":
                 self.values(n, type_name)
-            elif self.binary:
-                raise ValueError(
-                    "binary fields of strings before the points are not supported; "
-                    "save without them"
-                )
-            else:
-                for _ in range(min(n, len(self.data))):
+                continue
+            for _ in range(min(n, len(self.data))):
+                if self.binary:  # 2 bits: size of the length; the length; the string
+                    size = 8 >> (self.data[self.at : self.at + 1] or b"\0")[0] // 64
+                    length = int.from_bytes(self.data[self.at : self.at + size])
+                    self.at = min(self.at + size + length % 2 ** (8 * size - 2), len(self.data))
+                else:
                     self.line()
 
 
@@ -198,12 +172,12 @@ def _count_positions(values, n):
 
 
 def vtk_bytes(
-    X: np.ndarray, T: np.ndarray, scalars: dict[str, np.ndarray], title: str = "surface"
+    X: np.ndarray, T: np.ndarray, scalars: dict[str, np.ndarray], title: str = ""
 ) -> bytes:
     """Make a binary legacy file; 3D Slicer reads ``SPACE=RAS`` or ``SPACE=LPS`` in its title."""
     cells = np.column_stack([np.full(len(T), 3), T]).astype(">i4")
     parts = [
-        b"# vtk DataFile Version 3.0\n%b\nBINARY\nDATASET POLYDATA\n" % title.encode("ascii"),
+        b"# vtk DataFile Version 3.0\n%b\nBINARY\nDATASET POLYDATA\n" % (title or "S4A").encode(),
         b"POINTS %d double\n%b\n" % (len(X), X.astype(">f8").tobytes()),
         b"POLYGONS %d %d\n%b\n" % (len(T), cells.size, cells.tobytes()),
     ]
@@ -219,8 +193,10 @@ def vtk_bytes(
 # XML files
 
 
-def vtp_bytes(X: np.ndarray, T: np.ndarray, arrays: dict[str, np.ndarray]) -> bytes:
-    """Make an XML file with arrays in base64.
+def vtp_bytes(
+    X: np.ndarray, T: np.ndarray, arrays: dict[str, np.ndarray], title: str = ""
+) -> bytes:
+    """Make an XML file with arrays in base64, and `title` in a comment.
 
     Parameters
     ----------
@@ -237,10 +213,18 @@ def vtp_bytes(X: np.ndarray, T: np.ndarray, arrays: dict[str, np.ndarray]) -> by
     piece = f'<Piece NumberOfPoints="{len(X)}" NumberOfPolys="{len(T)}">'
     return (
         '<?xml version="1.0"?>\n<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" '
-        f'header_type="UInt64">\n<PolyData>\n{piece}\n<PointData>\n{fields}</PointData>\n'
+        f'header_type="UInt64">\n<PolyData>\n{_space_field(title)}{piece}\n<PointData>\n{fields}</PointData>\n'
         f"<Points>\n{_data_array('Points', X.astype('<f8'))}</Points>\n<Polys>\n{cells}</Polys>\n"
         "</Piece>\n</PolyData>\n</VTKFile>\n"
     ).encode()
+
+
+def _space_field(title):
+    """Field data with the axes in a title, as 3D Slicer reads them."""
+    space = re.search(r"SPACE=(\w+)", title)
+    codes = " ".join(str(ord(letter)) for letter in f"{space[1]}\0") if space else ""
+    array = '<Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">'
+    return f"<!-- {title} --><FieldData>\n{array}{codes}</Array>\n</FieldData>\n" if space else ""
 
 
 def _data_array(name, values):
@@ -256,26 +240,28 @@ def _data_array(name, values):
 
 def _parse_vtp(data):
     """Points, triangles and attributes of an XML file in any encoding, compressed or not."""
-    file = _Xml(data)
-    points, triangles, n_before = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
+    file = VtkXml(data)
+    points, cells, n_before = [np.empty((0, 3))], [], 0
     for piece in file.root.iter("Piece"):
-        if int(piece.get("NumberOfStrips") or 0):
-            raise ValueError("triangle strips are not supported; save the surface as triangles")
         X = file.values(piece.find("Points/DataArray")).reshape(-1, 3)
-        arrays = {"connectivity": np.empty(0, np.int64), "offsets": np.empty(0, np.int64)}
-        for node in piece.findall("Polys/DataArray"):
-            arrays[str(node.get("Name"))] = file.values(node).astype(np.int64)
-        offsets = np.r_[0, arrays["offsets"]]
-        for name, count in {"NumberOfPoints": len(X), "NumberOfPolys": len(offsets) - 1}.items():
+        counts = {"NumberOfPoints": len(X)}
+        for name in ("Polys", "Strips"):
+            arrays = {"connectivity": np.empty(0, np.int64), "offsets": np.empty(0, np.int64)}
+            for node in piece.findall(f"{name}/DataArray"):
+                arrays[str(node.get("Name"))] = file.values(node).astype(np.int64)
+            found = polygons(arrays["connectivity"], np.r_[0, arrays["offsets"]])
+            counts[f"NumberOf{name}"] = len(found[1])
+            corners, sizes = strips(*found) if name == "Strips" else found
+            cells.append((corners + n_before, sizes))
+        for name, count in counts.items():
             if int(piece.get(name) or 0) != count:
                 raise ValueError(f"expected {name} = {piece.get(name)}, found {count}")
-        triangles.append(fans(arrays["connectivity"], offsets) + n_before)
         points.append(X)
         n_before += len(X)
-    return np.concatenate(points), np.concatenate(triangles), {}
+    return np.concatenate(points), joined(cells), {}
 
 
-class _Xml:
+class VtkXml:
     """An XML file, with the encoding of its arrays."""
 
     def __init__(self, data):
@@ -297,9 +283,12 @@ class _Xml:
         self.size_type = np.dtype(self.order + ("u8" if is_64_bit else "u4"))
         self.compressor = self.root.get("compressor")
 
-    def values(self, node):
+    def values(self, node: Element) -> np.ndarray:
         """Read the numbers of a DataArray."""
-        dtype, text = _number_type(node.get("type"), self.order), node.text or ""
+        return self._bytes(node, _number_type(node.get("type"), self.order))
+
+    def _bytes(self, node, dtype):
+        text = node.text or ""
         if node.get("format") == "ascii":
             return np.array(text.split(), dtype)
         if node.get("format") == "appended":
@@ -309,6 +298,16 @@ class _Xml:
             raw = self._unpack(text.strip().encode(), True)
         self.limit -= len(raw)  # many arrays may refer to the same bytes
         return np.frombuffer(raw, dtype)
+
+    def strings(self, name: str) -> list[str]:
+        """Strings of an array in the field data of the file, which are zero-terminated."""
+        nodes = [node for node in self.root.iter() if node.get("Name") == name]
+        return [
+            text.decode("latin-1")
+            for node in nodes
+            if node.get("type") == "String"
+            for text in self._bytes(node, np.dtype("u1")).tobytes().split(b"\0")
+        ]
 
     def _unpack(self, data, is_base64):
         """Bytes of one array: sizes come first, then the array or its compressed blocks."""
@@ -321,7 +320,10 @@ class _Xml:
                 )
             return _take(data, w, length, is_base64)
         if self.compressor not in _COMPRESSORS:
-            raise ValueError(f"{' or '.join(_COMPRESSORS)} expected, found {self.compressor}")
+            raise ValueError(
+                f"{' or '.join(_COMPRESSORS)} expected, found {self.compressor}: save it with "
+                "compression by ZLib, or without"
+            )
         # number of blocks, size of a block, size of the last block, compressed size of each
         blocks = int(np.frombuffer(_take(data, 0, w, is_base64), self.size_type)[0])
         sizes = np.frombuffer(_take(data, 3 * w, blocks * w, is_base64), self.size_type).tolist()
@@ -354,8 +356,8 @@ def _take(data, start, length, is_base64):
     return raw[start:end]
 
 
-Surface = tuple[np.ndarray, np.ndarray, dict[str, str]]  # points, triangles, attributes
-_BRAIN = {"coordinate_system": "RAS", "unit": "mm"}  # of GIFTI and FreeSurfer
+# points, triangles (m, 3) or polygons, attributes
+Surface = tuple[np.ndarray, np.ndarray | Polygons, dict[str, str]]
 
 
 @dataclass(frozen=True)
@@ -372,7 +374,8 @@ class _Format:
     read : callable
         Function of bytes that returns a :data:`Surface`.
     write : callable, optional
-        Function of X ``(n, 3)``, T ``(m, 3)`` and a dict of values per vertex that returns bytes.
+        Function of X ``(n, 3)``, T ``(m, 3)``, a dict of values per vertex, and a title that may
+        have ``SPACE=RAS``, that returns bytes.
     scalars : bool
         The format can hold values per vertex.
     """
@@ -380,8 +383,31 @@ class _Format:
     suffixes: str
     signature: bytes
     read: Callable[[bytes], Surface]
-    write: Callable[[np.ndarray, np.ndarray, dict[str, Any]], bytes] | None = None
+    write: Callable[..., bytes] | None = None
     scalars: bool = False
+
+
+# other files that are found among meshes, by their first bytes
+_MAGICS = {
+    "an HDF5 file": rb"\x89HDF\r\n\x1a\n",
+    "a MATLAB file": rb"MATLAB \d",
+    "a glTF file": rb"glTF|\s*\{.*\"asset\"\s*:",
+    "a DICOM file": rb".{128}DICM",
+    "a MetaImage volume": rb"ObjectType\s*=",
+    "an FBX file": rb"Kaydara FBX",
+    "a Blender file": rb"BLENDER",
+    "a Gmsh file": rb"\$MeshFormat",
+    "a STEP file": rb"ISO-10303",
+    "a streamlines file": rb"TRACK\0|mrtrix tracks",
+    "an MRtrix image": rb"mrtrix image",
+    "a BrainVISA mesh": rb"(ascii|binar)(DCBA|ABCD)",
+    "a binary MNI surface": rb"p[\0-\xff]{3}[\x3c-\x3f]",
+    "an NPY array": rb"\x93NUMPY",
+    "a picture": rb"\x89PNG|\xff\xd8\xff|GIF8|II\*\0|MM\0\*",
+    "a PDF file": rb"%PDF",
+    "a compressed file": rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|\x28\xb5\x2f\xfd|Rar!",
+    "a program": rb"\x7fELF|MZ[\x80-\xff]",
+}
 
 
 def format_of(data: bytes) -> str:
@@ -402,16 +428,18 @@ def format_of(data: bytes) -> str:
     for name, kind in FORMATS.items():
         if kind.signature and re.match(kind.signature, head, re.DOTALL):
             return name
-    if len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
+    if re.match(rb"solid\b", head, re.I) and _STL_FACETS.search(data):
         return "STL"
-    if re.match(rb"solid\b", head, re.I) and re.search(rb"\bfacet\b|\bendsolid\b", data, re.I):
+    if is_utf_16(data):
+        raise ValueError("text in UTF-16 found: save it as UTF-8")
+    kind = next((kind for kind, magic in _MAGICS.items() if re.match(magic, data, re.DOTALL)), "")
+    if not kind and _is_binary_stl(data):
         return "STL"
-    if b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
+    if not kind and b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
         return "OBJ"
-    if b"\0" in head and len(data) >= 84:
-        return "STL"
     what = f"{len(data)} bytes" + " of an unknown format" * bool(data)
-    raise ValueError(f"one of {', '.join(FORMATS)} expected, found {what}")
+    found = f"{kind}: export the surface as one of them" if kind else what
+    raise ValueError(f"one of {', '.join(FORMATS)} expected, found {found}")
 
 
 def _integers(values):
@@ -452,12 +480,17 @@ def _ply_tables(data):
         raise ValueError("the header has no end_header")
     kind, elements = _ply_header(data[: end.start()].decode("latin-1"))
     body = data[end.end() :]
+    if second := re.search(rb"ply\s+format (ascii|binary_\w+_endian) ", body):
+        raise ValueError(
+            f"one mesh expected, found a second PLY at byte {end.end() + second.start()}: "
+            "write each mesh to a file of its own"
+        )
     if kind == "ascii":  # convert numbers to eight bytes each, for the binary reader
         body = np.array(body.split(), np.float64).tobytes()
     at, table = 0, {}
     for name, count, properties in elements:
         table[name], at = _ply_rows(body, at, name, count, properties)
-        if "vertex" in table and "face" in table:
+        if "vertex" in table and ("face" in table or "tristrips" in table):
             break
     return table
 
@@ -475,15 +508,26 @@ def ply_properties(data: bytes) -> dict[str, np.ndarray]:
 
 def _read_ply(data):
     table = _ply_tables(data)
-    vertex, face = table.get("vertex", {}), table.get("face", {})
+    vertex = table.get("vertex", {})
     if not all(axis in vertex for axis in "xyz"):
         elements = ", ".join(table) or "no element"
         if "vertex" in table:
             elements = f"an element vertex with {', '.join(vertex) or 'nothing'}"
         raise ValueError(f"an element vertex with x, y and z expected, found {elements}")
     points = np.stack([vertex[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    no_triangles = np.empty((0, 3))
-    return points, face.get("vertex_indices", face.get("vertex_index", no_triangles)), {}
+    cells = []
+    for element in ("face", "tristrips"):
+        for key in {"vertex_indices", "vertex_index"} & set(table.get(element, {})):
+            found = table[element][key]
+            cells.append(found if element == "face" else strips(*_split(*found)))
+    return points, joined(cells), {}
+
+
+def _split(corners, sizes):
+    """Split triangle strips where a corner is -1."""
+    number = np.cumsum(corners < 0) + np.repeat(np.arange(len(sizes)), sizes)
+    kept = corners >= 0
+    return corners[kept], np.unique(number[kept], return_counts=True)[1]
 
 
 def _ply_header(text):
@@ -519,8 +563,8 @@ def _ply_header(text):
 def _ply_rows(body, at, name, count, properties):
     """Columns of an element, and the start of the next.
 
-    The lists of face corners are converted to triangles; other lists are skipped.  If rows differ
-    in length, their other properties are skipped too.
+    The lists of corners are a column of polygons; other lists are skipped.  If rows differ in
+    length, their other properties are skipped too.
     """
     least = sum(types[0].itemsize for _, types in properties)
     _need(count, (len(body) - at) // max(least, 1), f"rows of {name}")
@@ -536,8 +580,7 @@ def _ply_rows(body, at, name, count, properties):
             columns = {key: rows[key] for key, types in properties if len(types) == 1}
             for key in lists:
                 if key.startswith("vertex_ind"):
-                    corners = _integers(rows[key]).ravel()
-                    columns[key] = fans(corners, np.arange(count + 1) * lists[key])
+                    columns[key] = _integers(rows[key]).ravel(), np.full(count, lists[key])
             return columns, at + count * stride
     return _ply_mixed_rows(body, at, name, count, properties)
 
@@ -561,7 +604,7 @@ def _ply_row(body, at, properties):
 
 
 def _ply_mixed_rows(body, at, name, count, properties):
-    """Triangles of the lists of corners, from rows of different length."""
+    """Polygons of the lists of corners, from rows of different length."""
     wanted = next((key for key, _ in properties if key.startswith("vertex_ind")), None)
     corners, sizes = [], []
     for row in range(count):
@@ -574,7 +617,7 @@ def _ply_mixed_rows(body, at, name, count, properties):
                 sizes.append(length)
     if wanted is None:
         return {}, at
-    return {wanted: fans(_integers(np.concatenate(corners)), np.cumsum([0, *sizes]))}, at
+    return {wanted: (_integers(np.concatenate(corners)), np.array(sizes))}, at
 
 
 # OBJ, OFF, STL
@@ -600,7 +643,7 @@ def _read_obj(data):
         raise ValueError("face indices from 1, or from -1 backwards, expected; found 0")
     # -1 is the last vertex before the face
     corners += np.where(corners > 0, -1, np.repeat(np.array(n_before, np.int64), sizes))
-    return points, fans(corners, np.cumsum([0, *sizes])), {}
+    return points, (corners, np.array(sizes, np.int64)), {}
 
 
 def _read_off(data):
@@ -620,10 +663,31 @@ def _read_off(data):
         sizes.append(int(size))
         _need(sizes[-1], len(words), "corners of a face")
         corners += words[: sizes[-1]]
-    return points, fans(np.array(corners, np.int64), np.cumsum([0, *sizes])), {}
+    return points, (np.array(corners, np.int64), np.array(sizes, np.int64)), {}
 
 
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+_STL_FACETS = re.compile(rb"^[ \t]*(?:facet|endsolid)\b", re.I | re.M)  # names are free text
+
+
+def _is_binary_stl(data):
+    """Whether data have the size of a binary STL, or else plausible triangles.
+
+    Triangles of a file that is cut short, or longer than its triangles, have normals of length 1 or
+    0 and coordinates within the range of those that programs write.
+    """
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) < 134 or len(data) == 84 + 50 * count:
+        return len(data) >= 84 and len(data) == 84 + 50 * count
+    rows = np.frombuffer(data, _STL_TRIANGLE, min((len(data) - 84) // 50, max(count, 1), 1000), 84)
+    with np.errstate(all="ignore"):
+        length = np.linalg.norm(rows["normal"].astype(float), axis=1)
+        size = np.abs(rows["corner"].astype(float))
+        is_normal = (np.abs(length - 1) < 0.01) | (length == 0)
+        is_usual = (size == 0) | ((size > 1e-15) & (size < 1e15))
+    return bool(is_normal.all() and is_usual.all() and size.any())
 
 
 def _read_stl(data):
@@ -631,17 +695,48 @@ def _read_stl(data):
     count = int.from_bytes(data[80:84], "little")
     starts_as_ascii = re.match(rb"\s*solid\b", data, re.I) and b"\0" not in data[:1000]
     if starts_as_ascii and len(data) != 84 + 50 * count:
-        vertices = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.I)
-        n_facets = len(re.findall(rb"\bfacet\b", data, re.I))
-        _need(3 * n_facets, len(vertices), "vertices of facets")
-        _need(1, len(re.findall(rb"\bendsolid\b", data, re.I)), "endsolid")
+        vertices = re.findall(rb"^[ \t]*vertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.I | re.M)
+        words = [word.split()[0].lower() for word in _STL_FACETS.findall(data)]
+        _need(3 * words.count(b"facet"), len(vertices), "vertices of facets")
+        _need(1, words.count(b"endsolid"), "endsolid")
         corners = np.array(vertices, np.float64)
     else:
         _need(count, (len(data) - 84) // 50, "triangles")
+        if len(data) >= 84 + 50 * (count + 1):
+            raise ValueError(
+                f"{count} triangles of {84 + 50 * count} bytes expected, found {len(data)} bytes: "
+                "write each mesh to a file of its own"
+            )
         corners = np.frombuffer(data, _STL_TRIANGLE, count, 84)["corner"].reshape(-1, 3)
     first, group = equal_rows(corners)
     rank = np.argsort(np.argsort(first))
     return corners[np.sort(first)], rank[group].reshape(-1, 3), {}
+
+
+def _read_mz3(data):
+    """Triangles and points of Surf Ice and NiiVue; colours and scalars may follow."""
+    kind, m, n, skip = struct.unpack_from("<HIII", data, 2)
+    if kind & 3 != 3:
+        raise ValueError("triangles and vertices expected, found an overlay of values or colours")
+    _need(12 * (m + n), len(data) - 16 - skip, "bytes of triangles and vertices")
+    triangles = np.frombuffer(data, "<i4", 3 * m, 16 + skip).reshape(m, 3)
+    return np.frombuffer(data, "<f4", 3 * n, 16 + skip + 12 * m).reshape(n, 3), triangles, {}
+
+
+def _read_mni(data):
+    """Polygons of MNI and CIVET: points, normals, colours, ends of the polygons, corners."""
+    words = data.split()
+    n = int(words[6])
+    points = np.array(words[7 : 7 + 3 * n], np.float64)
+    _need(6 * n + 2, len(words) - 7, "numbers of points and normals")
+    m, colours = (int(word) for word in words[7 + 6 * n : 9 + 6 * n])
+    at = 9 + 6 * n + 4 * {0: 1, 1: m, 2: n}.get(colours, 1)
+    ends = np.array(words[at : at + m], np.int64)
+    corners = np.array(words[at + m :], np.int64)
+    _need(m, len(ends), "polygons")
+    found = polygons(corners, np.r_[0, ends])
+    _need(len(found[0]), len(corners), "corners of polygons")
+    return points.reshape(-1, 3), found, {}
 
 
 # containers of arrays
@@ -698,21 +793,37 @@ def _read_gifti(data):
     arrays = gifti_arrays(data)
     points = [values for intent, values in arrays if intent == "POINTSET"]
     triangles = [values for intent, values in arrays if intent == "TRIANGLE"]
-    if not points or not triangles:
+    if len(points) != 1 or len(triangles) != 1:
         raise ValueError(
             "one set of points and one of triangles expected, "
-            f"found {len(points)} and {len(triangles)}"
+            f"found {len(points)} and {len(triangles)}: save each surface in a file of its own"
         )
-    return points[0], _integers(triangles[0]), _BRAIN
+    return points[0], _integers(triangles[0]), {}
+
+
+def freesurfer_counts(data: bytes) -> tuple[int, int, int]:
+    """Return the first byte after the counts, and the counts of vertices and triangles.
+
+    The comment before the counts ends with an empty line, or with one line end.
+    """
+    ends = [re.match(rb"[^\n]*\n(?:\r?\n)?", data), re.match(rb"(?s).*?\n\r?\n", data[:4096])]
+    n = m = -1
+    for end in filter(None, ends):
+        start = end.end() + 8
+        n, m = (int(k) for k in np.frombuffer(data[start - 8 : start].ljust(8, b"\0"), ">i4"))
+        if min(n, m) > 0 and 12 * (n + m) <= len(data) - start:
+            return start, n, m
+    if min(n, m) < 0:
+        raise ValueError("a comment and counts of vertices and triangles expected at the start")
+    _need(12 * (n + m), len(data) - start, "bytes of vertices and triangles")
+    return start, n, m
 
 
 def _read_freesurfer(data):
-    start = data.index(b"\n\n") + 2  # after two lines of comments
-    n, m = (int(k) for k in np.frombuffer(data, ">i4", 2, start))
-    _need(12 * (n + m), len(data) - start - 8, "bytes of vertices and triangles")
-    points = np.frombuffer(data, ">f4", 3 * n, start + 8).reshape(n, 3)
-    triangles = np.frombuffer(data, ">i4", 3 * m, start + 8 + 12 * n).reshape(m, 3)
-    return points, triangles, _BRAIN
+    start, n, m = freesurfer_counts(data)
+    points = np.frombuffer(data, ">f4", 3 * n, start).reshape(n, 3)
+    triangles = np.frombuffer(data, ">i4", 3 * m, start + 12 * n).reshape(m, 3)
+    return points, triangles, {}
 
 
 NPZ_KEYS = (
@@ -741,9 +852,10 @@ def _read_npz(data):
 # writers
 
 
-def _ply_bytes(X, T, scalars):
+def _ply_bytes(X, T, scalars, title=""):
     names = ["x", "y", "z", *(re.sub(r"\s", "_", name) for name in scalars)]
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(X)}\n"
+    comment = f"comment {title}\n" if title else ""
+    head = f"ply\nformat binary_little_endian 1.0\n{comment}element vertex {len(X)}\n"
     head += "".join(f"property float {name}\n" for name in names)
     head += f"element face {len(T)}\nproperty list uchar int vertex_indices\nend_header\n"
     vertex = np.column_stack([X, *scalars.values()]).astype("<f4")
@@ -752,26 +864,31 @@ def _ply_bytes(X, T, scalars):
     return head.encode() + vertex.tobytes() + face.tobytes()
 
 
-def _obj_bytes(X, T, _):
-    vertices = "".join("v {!r} {!r} {!r}\n".format(*x) for x in X.tolist())
+def _obj_bytes(X, T, _, title=""):
+    vertices = f"# {title}\n" * bool(title)
+    vertices += "".join("v {!r} {!r} {!r}\n".format(*x) for x in X.tolist())
     return (vertices + "".join("f {} {} {}\n".format(*t) for t in (T + 1).tolist())).encode()
 
 
-def _off_bytes(X, T, _):
+def _off_bytes(X, T, _, title=""):
     vertices = "".join("{!r} {!r} {!r}\n".format(*x) for x in X.tolist())
     faces = "".join("3 {} {} {}\n".format(*t) for t in T.tolist())
-    return f"OFF\n{len(X)} {len(T)} 0\n{vertices}{faces}".encode()
+    comment = f"# {title}\n" * bool(title)
+    return f"OFF\n{comment}{len(X)} {len(T)} 0\n{vertices}{faces}".encode()
 
 
-def _stl_bytes(X, T, _):
+def _stl_bytes(X, T, _, title=""):
     rows = np.zeros(len(T), _STL_TRIANGLE)
     rows["corner"] = X[T]
-    return b"binary".ljust(80) + len(T).to_bytes(4, "little") + rows.tobytes()
+    return f"binary {title}".encode().ljust(80) + len(T).to_bytes(4, "little") + rows.tobytes()
 
 
-def _gifti_bytes(X, T, scalars):
+def _gifti_bytes(X, T, scalars, title=""):
     from nibabel.gifti import gifti  # imported here only
 
+    space = gifti.GiftiCoordSystem(
+        *[2 if "SPACE=RAS" in title and "ORIGIN" not in title else 0] * 2
+    )
     arrays = [("POINTSET", X.astype(np.float32), {}), ("TRIANGLE", T, {})]
     for name, values in scalars.items():
         arrays.append(("SHAPE", values.astype(np.float32), {"Name": name}))
@@ -779,12 +896,12 @@ def _gifti_bytes(X, T, scalars):
     for intent, values, words in arrays:
         meta = gifti.GiftiMetaData(words)
         image.add_gifti_data_array(
-            gifti.GiftiDataArray(values, f"NIFTI_INTENT_{intent}", meta=meta)
+            gifti.GiftiDataArray(values, f"NIFTI_INTENT_{intent}", meta=meta, coordsys=space)
         )
     return image.to_bytes()
 
 
-def _npz_bytes(X, T, scalars):
+def _npz_bytes(X, T, scalars, title=""):
     out = io.BytesIO()
     np.savez_compressed(out, position=X, corner_vertex=T, **scalars)
     return out.getvalue()
@@ -801,4 +918,6 @@ FORMATS = {
     "GIFTI": _Format(".gii", b"<(.*<)?GIFTI", _read_gifti, _gifti_bytes, scalars=True),
     "NPZ": _Format(".npz", rb"PK\x03\x04", _read_npz, _npz_bytes, scalars=True),
     "FreeSurfer": _Format(SURFER, rb"\xff\xff\xfe", _read_freesurfer),
+    "MZ3": _Format(".mz3", rb"MZ[\0-\x7f]\0", _read_mz3),
+    "MNI": _Format(".obj", rb"P(\s+[-+.\de]+){5}\s+\d+\s", _read_mni),
 }

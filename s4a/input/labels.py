@@ -5,7 +5,9 @@ processing approach to fair surface design", 1995).
 """
 
 import io
+import math
 import os
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -13,21 +15,33 @@ import numpy as np
 from scipy import sparse
 
 from s4a.geometry.mesh import directed_edges
-from s4a.input.raw import check_there, content, reading
+from s4a.input.coordinates import CoordinateSystem, nifti_system
+from s4a.input.raw import check_there, content, gunzip, reading
 from s4a.options import check_label
 
-VOLUMES = {".nii": "NIfTI", ".mgz": "MGH", ".mgh": "MGH"}
+VOLUMES = {".nii": "NIfTI", ".mgz": "MGH", ".mgh": "MGH", ".nrrd": "NRRD"}
 Label = int | str | Iterable[int] | None
 ITERATIONS = 20  # of smoothing
 _UNPACKED = 2**29  # unpacked bytes that are always accepted: labels compress well
 SHRINK, GROW = 0.5, -0.51  # steps of an iteration: lambda and mu of Taubin
 MILLIMETRES = {"mm": 1.0, "unknown": 1.0, "meter": 1000.0, "micron": 0.001}
 _MOST_REPORTED = 30  # labels that an error lists
+_ROUNDED = 1e-3  # largest distance of a label from a whole number
+_SPACES = {
+    "left-posterior-superior": (-1, -1, 1),
+    "lps": (-1, -1, 1),
+    "ras": (1, 1, 1),
+    "right-anterior-superior": (1, 1, 1),
+    "left-anterior-superior": (-1, 1, 1),
+    "las": (-1, 1, 1),
+}  # of NRRD: signs of x, y and z in RAS
 
 
-def is_volume(data: bytes) -> bool:
-    """Return whether data start as a NIfTI or MGH volume."""
-    return data[344:348] in (b"n+1\0", b"ni1\0") or data[:4] == b"\0\0\0\1"
+def volume_format(data: bytes) -> str:
+    """Return the format of a volume, NIfTI, MGH or NRRD, by its first bytes; "" for other files."""
+    if data[344:348] in (b"n+1\0", b"ni1\0") or data[4:8] in (b"n+2\0", b"ni2\0"):
+        return "NIfTI"
+    return "MGH" if data[:4] == b"\0\0\0\1" else "NRRD" if data[:4] == b"NRRD" else ""
 
 
 def read_volume(
@@ -38,7 +52,8 @@ def read_volume(
     Parameters
     ----------
     path : str or Path
-        NIfTI (.nii) or FreeSurfer (.mgh, .mgz), optionally as .gz: integers in three dimensions.
+        NIfTI (.nii), FreeSurfer (.mgh, .mgz) or NRRD (.nrrd, .seg.nrrd), optionally as .gz:
+        integers in three dimensions.  Values within 0.001 of integers are rounded.
     label : int, list of int, or "all"
         Several labels are merged, "all" means every voxel that is not 0.
     iterations : int
@@ -47,12 +62,12 @@ def read_volume(
     Returns
     -------
     points : float64 ndarray (n, 3)
-        In millimetres, RAS if the file has an orientation.
+        In millimetres, RAS if the file has an orientation (:mod:`s4a.input.coordinates`).
     triangles : int32 ndarray (m, 3)
         Counter-clockwise seen from outside.
     attrs : dict of str
         ``format``, ``unit``, ``coordinate_system``, ``label``, and ``note`` if the volume has no
-        orientation, or the surface was closed at its border.
+        orientation, its labels were rounded, or the surface was closed at its border.
 
     Raises
     ------
@@ -69,7 +84,7 @@ def read_volume(
     points = points @ affine[:3, :3].T + affine[:3, 3]
     if np.linalg.det(affine[:3, :3]) < 0:
         triangles = triangles[:, ::-1]
-    attrs |= {"label": str(checked), "unit": "mm"}
+    attrs |= {"label": str(checked)}
     if at_border:
         closed = "the structure reaches the border of the volume, and was closed there"
         attrs["note"] = "; ".join(filter(None, [attrs.get("note"), closed]))
@@ -85,50 +100,141 @@ def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarra
     return _marked(values, check_label(label)), affine
 
 
-def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], np.ndarray]:
-    """Read the shape of a volume, of labels or grey values, and its affine map to mm, RAS.
+def read_grid(
+    path: str | os.PathLike[str],
+) -> tuple[tuple[int, ...], np.ndarray, CoordinateSystem]:
+    """Read the shape of a volume, of labels or grey values, its affine map, and its system.
 
     Raises
     ------
     ValueError
-        If the file is not a NIfTI or MGH volume of three dimensions.
+        If the file is not a NIfTI, MGH or NRRD volume of three dimensions.
     """
     check_there(path)
     with reading(path, "a volume"):
-        kind, name = _kind_of(data := content(Path(path), _UNPACKED))
-        header = kind.header_class.from_fileobj(io.BytesIO(data))
-        return _shape_of(header), _affine_of(header, name)[0]
+        return grid_of(content(Path(path), _UNPACKED))
+
+
+def grid_of(data: bytes) -> tuple[tuple[int, ...], np.ndarray, CoordinateSystem]:
+    """Return shape, affine map and coordinate system of a volume; see :func:`read_grid`."""
+    kind, name = _kind_of(data := _as_nifti(data))
+    header = kind.header_class.from_fileobj(io.BytesIO(data))
+    affine, is_oriented = _affine_of(header, name)
+    codes = [0, 2] if name == "MGH" else [int(header[f"{form}form_code"]) for form in "qs"]
+    system = nifti_system(codes[1] or codes[0]) if is_oriented else CoordinateSystem(unit="mm")
+    return _shape_of(header), affine, system
 
 
 def _volume(data):
     """Labels (x, y, z), affine map of indices to millimetres, and attributes."""
+    found, data = volume_format(data), _as_nifti(data)
     kind, name = _kind_of(data)
     header = kind.header_class.from_fileobj(io.BytesIO(data))
-    shape = _shape_of(header)
+    shape, affine, system = grid_of(data)
     needed = int(np.prod(shape, dtype=object)) * header.get_data_dtype().itemsize
     n_bytes = 284 if name == "MGH" else 352
     if needed + n_bytes > len(data):
         raise ValueError(f"{needed} bytes of voxels {shape} expected, found {len(data) - n_bytes}")
-    values = np.asanyarray(kind.from_bytes(data).dataobj).reshape(shape)
-    if values.dtype.kind not in "iub":
-        if values.dtype.kind != "f" or not np.array_equal(values, np.round(values)):
-            raise ValueError("integers expected: this is not a label volume")
-        values = values.astype(np.int64)
-    affine, is_oriented = _affine_of(header, name)
-    note = "the volume has no orientation, left and right may be exchanged"
-    frame = {"coordinate_system": "RAS"} if is_oriented else {"note": note}
-    return values, affine, {"format": name} | frame
+    values, rounded = _whole(np.asanyarray(kind.from_bytes(data).dataobj).reshape(shape))
+    notes = (
+        [] if system.axes else ["the volume has no orientation, left and right may be exchanged"]
+    )
+    notes += [rounded] if rounded else []
+    return (
+        values,
+        affine,
+        {"format": found, **system.attrs} | ({"note": "; ".join(notes)} if notes else {}),
+    )
+
+
+def _whole(values):
+    """Labels as integers, and a note if they were rounded; ValueError for other values."""
+    if values.dtype.kind in "iub":
+        return values, ""
+    with np.errstate(all="ignore"):
+        labels = np.round(values) if values.dtype.kind == "f" else values
+        rest = np.abs(labels - values)
+        if not ((rest <= _ROUNDED) & (np.abs(labels) < 2**53)).all():
+            wrong = values[~(rest <= _ROUNDED)].ravel()[:1]
+            raise ValueError(
+                f"integers expected, found {wrong[0] if len(wrong) else values.max()}: this is not "
+                "a label volume"
+            )
+    most = float(rest.max(initial=0))
+    note = f"labels differed from integers by up to {most:.1g} and were rounded" if most else ""
+    return labels.astype(np.int64), note
 
 
 def _kind_of(data):
     """Class of nibabel for the first bytes of a file, and name of the format."""
     import nibabel
 
-    if data[:4] == b"\0\0\0\1":
-        return nibabel.MGHImage, "MGH"
-    if is_volume(data):
-        return nibabel.Nifti1Image, "NIfTI"
-    raise ValueError(f"NIfTI or MGH expected, found {len(data)} bytes of an unknown format")
+    name = volume_format(data)
+    if not name:
+        raise ValueError(
+            f"NIfTI, MGH or NRRD expected, found {len(data)} bytes of an unknown format"
+        )
+    if name == "MGH":
+        return nibabel.MGHImage, name
+    return (nibabel.Nifti2Image if data[6:7] == b"2" else nibabel.Nifti1Image), name
+
+
+def _as_nifti(data):
+    """NIfTI file of an NRRD volume, as 3D Slicer writes segmentations; other data as they are."""
+    import nibabel
+
+    if volume_format(data) != "NRRD":
+        return data
+    end = re.search(rb"\r?\n\r?\n", data)
+    head = data[: end.start() if end else len(data)].decode("latin-1")
+    fields = dict(re.findall(r"^([\w ]+):[ \t]*(.*?)\s*$", head, re.M))
+    missing = [name for name in ("type", "sizes", "encoding") if name not in fields]
+    if not end or missing or {"data file", "datafile"} & set(fields):
+        raise ValueError(
+            "a header with type, sizes and encoding, and voxels in the same file, expected; save "
+            "it as one .nrrd file"
+        )
+    values = _nrrd_values(fields, data[end.end() :])
+    image = nibabel.Nifti1Image(values, None, dtype=values.dtype)
+    image.header.set_xyzt_units("mm")
+    axes = re.findall(r"\(([^()]*)\)", fields.get("space directions", ""))
+    axes = np.array([axis.split(",") for axis in axes], float)
+    signs = _SPACES.get(fields.get("space", "").lower())
+    if signs and axes.shape == (3, 3):
+        origin = fields.get("space origin", "(0,0,0)").strip("()").split(",")
+        affine = np.eye(4)
+        affine[:3] = np.c_[axes.T, np.array(origin, float)] * np.array(signs)[:, None]
+        image.set_sform(affine, code="aligned")
+    else:
+        spacings = np.array(fields.get("spacings", "1 1 1").split(), float)
+        image.header.set_zooms(np.linalg.norm(axes, axis=1) if len(axes) else spacings)
+    return image.to_bytes()
+
+
+def _nrrd_values(fields, body):
+    """Voxels (x, y, z) of an NRRD file."""
+    names = {"char": 1, "int8": 1, "short": 2, "int16": 2, "int": 4, "int32": 4, "long long": 8,
+             "longlong": 8, "int64": 8}  # fmt: skip
+    found = re.fullmatch(r"(u|unsigned )?(?:signed )?(\w+?|long long)(?: int|_t)?", fields["type"])
+    floats = {"float": "f4", "double": "f8"}
+    if not found or found[2] not in names | floats:
+        raise ValueError(f"numbers expected, found the type {fields['type']}")
+    code = floats.get(found[2]) or f"{'u' if found[1] else 'i'}{names[found[2]]}"
+    if fields["encoding"] in ("gzip", "gz"):
+        body = gunzip(io.BytesIO(body), _UNPACKED)
+    elif fields["encoding"] != "raw":
+        raise ValueError(f"the encoding raw or gzip expected, found {fields['encoding']}")
+    sizes = [int(word) for word in fields["sizes"].split()]
+    if len(sizes) != 3:
+        raise ValueError(
+            f"three sizes expected, found {sizes}: segments may overlap; export them in 3D Slicer "
+            "as a label map"
+        )
+    dtype = np.dtype((">" if fields.get("endian") == "big" else "<") + code)
+    needed = math.prod(sizes) * dtype.itemsize
+    if min(sizes) < 1 or needed > len(body):
+        raise ValueError(f"{needed} bytes of voxels {sizes} expected, found {len(body)}")
+    return np.frombuffer(body, dtype, math.prod(sizes)).reshape(sizes, order="F")
 
 
 def _shape_of(header):

@@ -29,7 +29,14 @@ from s4a.geometry.mesh import (
     vertex_normals,
     volume,
 )
-from s4a.input.chirality import COMMON_SIDE, MIRROR, OTHER_SIDE, mean_chirality
+from s4a.input.chirality import (
+    COMMON_SIDE,
+    MIRROR,
+    OTHER_SIDE,
+    clearly_mirrored,
+    fits_mirrored,
+    mean_chirality,
+)
 from s4a.input.subjects import listed as first_of
 from s4a.schema import dataset
 
@@ -491,7 +498,6 @@ def _sizes(attrs, remarks):
             f"two groups of sizes, with the ratio {ratio:.3g}: {first_of(names[group], most=6)}, "
             "and the others; no size was changed: scale the files of one group if units differ"
         )
-    _different_units(attrs, remarks)
     if len(names) < 2:
         return
     far = np.abs(excess(values, SIZE)) if len(names) >= _ENOUGH else np.zeros(len(names))
@@ -527,16 +533,6 @@ def _two_sizes(values):
         # on a tie, the group of the first name stays
         group[low if (len(low), 0 in low) < (len(high), 0 in high) else high] = True
     return group
-
-
-def _different_units(attrs, remarks):
-    for key in ("unit", "coordinate_system"):
-        values = {name: shape[key] for name, shape in attrs.items() if shape.get(key)}
-        if len(set(values.values())) > 1:
-            remarks.append(
-                f"the files have different {key.replace('_', ' ')}s, and none was converted "
-                f"({_names_by(values)})"
-            )
 
 
 def _genus(attrs, remarks):
@@ -582,26 +578,25 @@ def _duplicates(comparisons):
 
 def _mirrored(comparisons, remarks):
     """Flags of shapes of the less common side, if the shapes of the collection are chiral."""
-    fits = ("fit", "fit_mirrored")
     names, mean = np.array(list(comparisons)), mean_chirality(comparisons)
     fit, fit_mirrored = (
-        np.array([np.nanmedian(data[key]) for data in comparisons.values()]) for key in fits
+        np.array([np.nanmedian(data[key]) for data in comparisons.values()])
+        for key in ("fit", "fit_mirrored")
     )
     usual = np.median(np.minimum(fit, fit_mirrored))
     close = (fit_mirrored < CLOSE * usual) | (fit_mirrored < fit / CLOSE)
-    other = (mean < -OTHER_SIDE) & close
-    if np.median(np.abs(mean)) < COMMON_SIDE or not other.any():
+    other = names[(mean < -OTHER_SIDE) & close].tolist()
+    clear = clearly_mirrored(comparisons, other)
+    if np.median(np.abs(mean)) < COMMON_SIDE or not clear:
         return
-    if 2 * other.sum() == len(names):
+    if 2 * len(clear) == len(names):
+        rest = [name for name in names if name not in clear]
         remarks.append(
-            f"mirror images of each other, by ICP: {first_of(names[~other], most=6)} and "
-            f"{first_of(names[other], most=6)}; none was changed"
+            f"mirror images of each other, by ICP: {first_of(rest, most=6)} and "
+            f"{first_of(clear, most=6)}; none was changed"
         )
-    for name in names[other] if len(names) > 2 else ():
-        data = comparisons[name]
-        common = ~np.isin(data["reference"].values, names[other])
-        common |= not common.any()
-        yield name, flag("mirrored", **{k: np.nanmedian(data[k].values[common]) for k in fits})
+    for name, fits in fits_mirrored(comparisons, clear if len(names) > 2 else []).items():
+        yield name, flag("mirrored", fit=fits[0], fit_mirrored=fits[1])
 
 
 def _boundaries(comparisons):

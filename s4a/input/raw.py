@@ -129,6 +129,24 @@ def shown(text: object) -> str:
     return "".join(escaped)
 
 
+def sentences(text: str, longest: int) -> str:
+    """Return the sentences of a text, from the first, that fit in so many characters; one at least.
+
+    A sentence ends with a full stop or a semicolon that is not in brackets.
+
+    Examples
+    --------
+    >>> from s4a.input.raw import sentences
+    >>> sentences("a is far (b; c); it was not moved. It is 3 mm away.", 35)
+    'a is far (b; c); it was not moved.'
+    >>> sentences("a is far (b; c); it was not moved", 9)
+    'a is far (b; c)'
+    """
+    ends = [end.start() + 1 for end in re.finditer(r"[.;](?= (?![^(]*\)))", text)] + [len(text)]
+    fitting = max([end for end in ends if end <= longest], default=ends[0])
+    return text[:fitting].removesuffix(";")
+
+
 def text_of(data: bytes) -> str:
     """Decode the text of a file in UTF-8, with or without a byte order mark.
 
@@ -147,7 +165,7 @@ def text_of(data: bytes) -> str:
     """
     if data.startswith(_WORKBOOKS):
         raise ValueError("text expected, found a workbook or an archive: export it as CSV UTF-8")
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or _every_other_is_nul(data):
+    if is_utf_16(data):
         raise ValueError("text in UTF-8 expected, found UTF-16: save it as CSV UTF-8")
     if b"\0" in data:
         line = 1 + data[: data.index(b"\0")].count(b"\n")
@@ -167,8 +185,10 @@ def text_of(data: bytes) -> str:
         ) from error
 
 
-def _every_other_is_nul(data):
-    """Whether data seem to be UTF-16 without a mark, of mostly Latin letters."""
+def is_utf_16(data: bytes) -> bool:
+    """Return whether data seem to be UTF-16, without a mark if of mostly Latin letters."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return True
     head = data[:1000]
     shares = sorted(half.count(0) / max(len(half), 1) for half in (head[::2], head[1::2]))
     return len(head) > 1 and shares[0] < 0.1 and shares[1] > 0.6

@@ -1,5 +1,6 @@
 """Tables of covariates and groups of the shapes (6.1), for the statistics."""
 
+import itertools
 import logging
 import re
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from s4a.input.annotations import is_number, table_rows
-from s4a.input.files import slug, stem_of
+from s4a.input.files import slug, stem_of, visible
 from s4a.input.raw import content, reading, text_of
 from s4a.schema import covariate
 
@@ -24,6 +25,8 @@ def _head_and_rows(path):
     with reading(path, "a table"):
         rows = table_rows(text_of(content(path)))
     head = rows.pop(next(iter(rows)))
+    head = ["shape" if visible(name).lower() == "shape" else visible(name) for name in head]
+    head, rows = _without_empty(head, rows)
     if "shape" not in head:
         raise ValueError(
             f"{path}: a column 'shape' with names or files of the shapes needed; found {head}"
@@ -42,9 +45,20 @@ def _head_and_rows(path):
     return head, list(rows.values())
 
 
+def _without_empty(head, rows):
+    """Drop rows and columns without any text, which spreadsheets write."""
+    rows = {line: row for line, row in rows.items() if any(row)}
+    every = [head, *rows.values()]
+    columns = itertools.zip_longest(*every, fillvalue="")
+    filled = [i for i, column in enumerate(columns) if any(column)]
+    head, *kept = ([row[i] for i in filled if i < len(row)] for row in every)
+    return head, dict(zip(rows, kept, strict=True))
+
+
 def _shape_of(cell, names):
     """Shape that a cell names, by its name or its file; the cell itself if there is none."""
-    *folders, file = Path(cell).parts or [""]
+    cell = visible(cell)
+    *folders, file = re.split(r"[/\\]", cell)
     # names of shapes may begin with the names of their folders
     ends = [[*folders[i:], stem_of(file)] for i in range(len(folders) + 1)]
     candidates = (cell, slug(cell), *(slug("/".join(end)) for end in ends))

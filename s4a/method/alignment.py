@@ -17,11 +17,13 @@ from s4a.geometry.align import (
     N_POSES,
     ROUGH,
     RigidTransform,
+    icp,
     icp_each,
     point_to_point,
     poses,
     realign,
     relative_transform,
+    residual_of,
     rigid_transform,
 )
 from s4a.input.plausibility import flag
@@ -115,6 +117,14 @@ def pair_transform(
     if alignment == "search":
         return realign(source.cloud, target.cloud, start)
     return transform_onto(source, target, alignment)
+
+
+def alignment_residual(source: Basis, target: Basis, transform: RigidTransform) -> float:
+    """Root mean square distance of nearest vertices, in both directions, after a transform."""
+    clouds = [
+        basis.cloud._replace(normals=None, tree=cKDTree(basis.X)) for basis in (source, target)
+    ]
+    return residual_of(icp(*clouds, *transform, iterations=1))
 
 
 def align_onto(

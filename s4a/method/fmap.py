@@ -286,6 +286,7 @@ def zoomout(
     *,
     step: int = 5,
     nearest: Callable[..., Any] = nearest_rows,
+    keep: Callable[..., Any] | None = None,
 ) -> tuple[Array, Array]:
     """Refine a functional map by ZoomOut (4.1) until it is k x k.
 
@@ -300,6 +301,8 @@ def zoomout(
         Growth per iteration.
     nearest : callable
         Nearest-neighbour search with the signature of :func:`s4a.method.nearest.nearest_rows`.
+    keep : callable, optional
+        Called with the map and the match of each iteration.
 
     Returns
     -------
@@ -317,10 +320,13 @@ def zoomout(
     Transactions on Graphics 38(6).
     """
     sizes = [*range(C.shape[0] + step, k, step), k] if k > C.shape[0] else []
-    for size in sizes:
+    for size in [*sizes, 0]:
         match = match_from_fmap(C, source.Phi, target.Phi, nearest=nearest)
-        C = fmap_from_match(source.Phi[:, :size], target.Phi[:, :size], target.mass, match)
-    return C, match_from_fmap(C, source.Phi, target.Phi, nearest=nearest)
+        if keep:
+            keep(C, match)
+        if size:
+            C = fmap_from_match(source.Phi[:, :size], target.Phi[:, :size], target.mass, match)
+    return C, match
 
 
 def refine_once(source: Basis, target: Basis, C: Array, n_samples: int = 0) -> Array:
@@ -433,8 +439,8 @@ def fmap_from_landmarks(
 ) -> Array:
     """Fit a functional map to heat kernels around landmark pairs (step 4 of 4.1).
 
-    :func:`fit` with F and G at 8 times and the penalty commute |F|^2 (mu_i - lambda_j)^2 /
-    lambda_max^2.
+    :func:`fit` with the :func:`landmark_descriptors` and the penalty commute |F|^2 (mu_i -
+    lambda_j)^2 / lambda_max^2.
 
     Parameters
     ----------
@@ -447,14 +453,37 @@ def fmap_from_landmarks(
     -------
     C : float ndarray (k, k)
     """
+    F, G = landmark_descriptors(source, target, landmark_source, landmark_target)
+    penalty = commute * np.trace(F @ F.T) * _commutator(source.eigenvalue, target.eigenvalue)
+    return fit(F, G, penalty=penalty, constant=_constant_to_constant(source, target))
+
+
+def landmark_descriptors(
+    source: Basis, target: Basis, landmark_source: Array, landmark_target: Array
+) -> tuple[Array, Array]:
+    """Return the coefficients of heat kernels around p landmarks at 8 times, each of norm 1.
+
+    Parameters
+    ----------
+    source, target, landmark_source, landmark_target : see :func:`fmap_from_landmarks`
+
+    Returns
+    -------
+    F, G : float ndarray (k, 8 p)
+        Of source and target.
+    """
     coefficients, landmarks = [], (landmark_source, landmark_target)
     for end, other, landmark in zip((source, target), (target, source), landmarks, strict=True):
         kernel = heat_filter(end.eigenvalue, other.eigenvalue, n=8)  # (8, k)
         F = landmark_coefficients(end.Phi, kernel, landmark)  # (k, 8 p)
         coefficients.append(F / np.linalg.norm(F, axis=0))
-    F, G = coefficients
-    penalty = commute * np.trace(F @ F.T) * _commutator(source.eigenvalue, target.eigenvalue)
-    return fit(F, G, penalty=penalty, constant=_constant_to_constant(source, target))
+    return coefficients[0], coefficients[1]
+
+
+def landmark_energies(source: Basis, target: Basis, C: Array, F: Array, G: Array) -> Array:
+    """Return both terms ``(2,)`` of the energy of :func:`fmap_from_landmarks` for a map C."""
+    penalty = LAPLACIAN * (F**2).sum() * _commutator(source.eigenvalue, target.eigenvalue)
+    return np.array([((C @ F - G) ** 2).sum(), (penalty * C**2).sum()])
 
 
 def fmap_from_descriptors(

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
+import xarray as xr
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
@@ -18,7 +19,7 @@ from s4a.geometry.mesh import edges
 from s4a.method import fmap, spectral_icp
 from s4a.method.shape import Basis, common_fields, corresponding_landmarks, field_columns
 from s4a.options import check
-from s4a.schema import Array
+from s4a.schema import Array, dataset
 
 N_LANDMARKS = 10  # of step 3
 # maps that a search tries for a pair: signatures, number of functions relative to k_init, weight of
@@ -39,7 +40,18 @@ class _InitialMap(NamedTuple):
     C: Array  # (k_init, k_init)
     fitted: Array  # (k_init, k_init), before the step of ZoomOut
     near: Array  # (n_target,), nearest neighbours in space after the rigid transform
-    landmarks: tuple[Array, Array] | None  # of source and target, with init="landmarks"
+    landmarks: tuple[Array, Array] | None = None  # of source and target, with init="landmarks"
+    descriptors: tuple[Array, Array] | None = None  # of source and target, with init="landmarks"
+    energies: Array | None = None  # both terms of the fit to them
+
+    def fit_to_landmarks(self, keep_descriptors: bool) -> xr.Dataset:
+        """Return the terms of the fit to landmarks and, if asked for, the descriptors."""
+        if self.descriptors is None or self.energies is None:
+            return xr.Dataset()
+        energies = dict(zip(("descriptor_energy", "laplacian_energy"), self.energies, strict=True))
+        F, G = (values.astype(np.float32) for values in self.descriptors)
+        descriptors = {"descriptor_of_source": F, "descriptor_of_target": G}
+        return dataset(None, **energies, **(descriptors if keep_descriptors else {}))
 
 
 def nearest_after_alignment(source: Basis, target: Basis, transform: RigidTransform) -> Array:
@@ -73,13 +85,17 @@ def landmarks_after_alignment(X: Array, Y: Array, transform: RigidTransform) -> 
 
 def fit_after_alignment(
     source: Basis, target: Basis, transform: RigidTransform, *, k_init: int, init: str, near: Array
-) -> tuple[Array, tuple[Array, Array] | None]:
-    """Fit a map, and return it with the landmarks of both shapes (None with ``init="dense"``)."""
+) -> _InitialMap:
+    """Fit a map to all nearest neighbours, or to landmarks (step 4); it is not refined."""
     M, N = source.truncated(k_init), target.truncated(k_init)
     if init == "dense":
-        return fmap.fmap_from_match(M.Phi, N.Phi, N.mass, near), None
+        C = fmap.fmap_from_match(M.Phi, N.Phi, N.mass, near)
+        return _InitialMap(init, C, C, near)
     landmarks = landmarks_after_alignment(M.X, N.X, transform)
-    return fmap.fmap_from_landmarks(M, N, *landmarks), landmarks
+    C = fmap.fmap_from_landmarks(M, N, *landmarks)
+    F, G = fmap.landmark_descriptors(M, N, *landmarks)
+    energies = fmap.landmark_energies(M, N, C, F, G)
+    return _InitialMap(init, C, C, near, landmarks, (F, G), energies)
 
 
 def map_after_alignment(
@@ -109,11 +125,10 @@ def map_after_alignment(
     """
     check("init", init)
     near = nearest_after_alignment(source, target, transform)
-    fitted, landmarks = fit_after_alignment(
-        source, target, transform, k_init=k_init, init=init, near=near
-    )
-    C = fmap.refine_once(source, target, fitted, n_samples) if initial_refinement else fitted
-    return _InitialMap(init, C, fitted, near, landmarks)
+    initial = fit_after_alignment(source, target, transform, k_init=k_init, init=init, near=near)
+    if not initial_refinement:
+        return initial
+    return initial._replace(C=fmap.refine_once(source, target, initial.fitted, n_samples))
 
 
 def stretch(target: Basis, X: Array) -> float:
@@ -294,4 +309,4 @@ def initial_map(
     if not (differ and _have_signatures(source, target, len(initial.C))):
         return initial
     name, C, fitted = best_initial_map(source, target, initial.C, initial.fitted, search=search)
-    return _InitialMap(name, C, fitted, initial.near, None)
+    return _InitialMap(name, C, fitted, initial.near)

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from s4a.geometry.align import RigidTransform
 from s4a.method.alignment import pair_transform
-from s4a.method.fmap import fmap_from_match
+from s4a.method.fmap import fmap_from_match, orthogonality_error
 from s4a.method.initial_map import initial_map
 from s4a.method.median import area_differences, conformal_differences, distance_to_identity
 from s4a.method.nearest import (
@@ -255,6 +255,36 @@ def latent_basis(
     return Y, np.maximum(latent_eigenvalue, 0.0)
 
 
+def isometric_maps(C: Array, source: Array, target: Array) -> Array:
+    """Replace both maps of each pair by the more orthogonal one and its transpose ``(p, k, k)``.
+
+    The maps of an isometry are orthogonal, and transposes of each other.  This is pyFM's reading of
+    Consistent ZoomOut (``FMN.set_isometries``).
+
+    Parameters
+    ----------
+    C : float ndarray (p, k, k)
+    source, target : int ndarray (p,)
+        Shapes of each map.  A map without a map in the other direction stays as it is.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.method.latent import isometric_maps
+    >>> isometric_maps(np.array([[[1.0]], [[3.0]]]), np.array([0, 1]), np.array([1, 0])).tolist()
+    [[[1.0]], [[1.0]]]
+    """
+    row = {pair: r for r, pair in enumerate(zip(source.tolist(), target.tolist(), strict=True))}
+    error = [orthogonality_error(c) for c in C]
+    C = C.copy()
+    for (i, j), r in row.items():
+        back = row.get((j, i), r)
+        if r < back:
+            better, worse = (r, back) if error[r] <= error[back] else (back, r)
+            C[worse] = C[better].T
+    return C
+
+
 def latent_size(n_latent: int | None, k: int, k_final: int) -> int:
     """Return the latent dimension at size k: at most k, in proportion to `n_latent` / `k_final`."""
     return k if n_latent is None else min(k, max(1, round(k * n_latent / k_final)))
@@ -270,11 +300,13 @@ def consistent_zoomout(
     step: int = 5,
     n_latent: int | None = None,
     weights: str = "cycles",
+    isometric: bool = False,
     samples: list[Array] | None = None,
     dense_iterations: int = DENSE_ITERATIONS,
     n_jobs: int | None = 1,
     progress: Callable[..., Any] | None = None,
     keep: Callable[..., Any] | None = None,
+    keep_matches: Callable[..., Any] | None = None,
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Refine the maps of a network by Consistent ZoomOut (4.2) until all are k x k.
 
@@ -301,6 +333,8 @@ def consistent_zoomout(
         Final latent dimension; k by default.
     weights : {"cycles", "equal"}
         Weights of the maps: by cycle error, or 1 for all.
+    isometric : bool
+        Whether each iteration starts with :func:`isometric_maps`.
     samples : list of int ndarray, optional
         Farthest-point samples of every shape, at least 2 k unless they are all vertices; all
         vertices by default.
@@ -311,7 +345,10 @@ def consistent_zoomout(
     progress : callable, optional
         Called with the current size after each iteration.
     keep : callable, optional
-        Called with C, Y and the latent eigenvalues of each iteration.
+        Called with C, Y, the latent eigenvalues, weights and cycle errors of each iteration.
+    keep_matches : callable, optional
+        Called with the matches of each iteration (eq. 3): for every map the matched coarse vertices
+        of the source, and the coarse vertices of the target.
 
     Returns
     -------
@@ -340,6 +377,7 @@ def consistent_zoomout(
     for size, next_size in zip(
         sizes, [*sizes[1:], None], strict=True
     ):  # the last only solves for Y
+        C = isometric_maps(C, source, target) if isometric and next_size else C
         error = cycle_errors(C, cycles, n_jobs=n_jobs)
         weight = cycle_weights(error) if weights == "cycles" else np.ones(len(C))
         m = latent_size(n_latent, size, k)
@@ -350,11 +388,17 @@ def consistent_zoomout(
         if progress:
             progress(size)
         if keep:
-            keep(C, Y, latent_eigenvalue)
+            keep(C, Y, latent_eigenvalue, weight, error)
         if next_size:
             del C  # so that maps of only one size are in memory
             dense_bases = bases if size in dense_sizes else None
-            C = _larger_maps(sampled, Y, source, target, next_size, dense_bases, n_jobs)
+            C, match = _larger_maps(sampled, Y, source, target, next_size, dense_bases, n_jobs)
+        elif keep_matches:
+            match = _sample_matches(sampled, Y, source, target, n_jobs)
+        if keep_matches:
+            if size not in dense_sizes:  # matches are between samples
+                match = [sampled[i].vertex[m] for i, m in zip(source, match, strict=True)]
+            keep_matches(match, [sampled[j].vertex for j in target])
     return C, weight, error, Y, latent_eigenvalue
 
 
@@ -370,6 +414,11 @@ class _Sampled(NamedTuple):
     area: Array
     around: Array
     n: int  # vertices of the shape
+
+    @property
+    def vertex(self) -> Array:
+        """The samples, as vertices ``(s,)``."""
+        return self.around[:, 0]
 
 
 def _check_samples(sampled, k):
@@ -395,7 +444,7 @@ def sample(basis: Basis, vertex: Array | None, k: int, n_around: int) -> _Sample
 
 
 def _larger_maps(sampled, Y, source, target, k, bases, n_jobs=1):
-    """Maps ``(p, k, k)`` from matches of the latent functions (eq. 3): one step of ZoomOut.
+    """Maps ``(p, k, k)`` and the matches of the latent functions that they follow from (eq. 3).
 
     Parameters
     ----------
@@ -427,7 +476,7 @@ def _larger_maps(sampled, Y, source, target, k, bases, n_jobs=1):
             solve, query = prepared[target[r]]
             matched = match[r]
             if bases is not None:
-                matched = nearest_around(query, rows, sampled[i].around[matched])
+                match[r] = matched = nearest_around(query, rows, sampled[i].around[matched])
             C[r] = solve @ Phi.take(matched, axis=0)
 
     for begin in range(0, len(sampled), TARGETS):
@@ -435,7 +484,7 @@ def _larger_maps(sampled, Y, source, target, k, bases, n_jobs=1):
         prepared = dict(zip(block, in_threads(solver_and_query, block, n_jobs), strict=True))
         some_maps = np.flatnonzero((target >= begin) & (target < begin + TARGETS))
         in_threads(maps_from, np.unique(source[some_maps]), n_jobs)
-    return C
+    return C, match
 
 
 def _sample_matches(sampled, Y, source, target, n_jobs=1):

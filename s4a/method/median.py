@@ -84,17 +84,29 @@ def distance_to_identity(D: Array, latent_eigenvalue: Array, norm: str = "h2") -
     return np.linalg.norm(weighted[:, varying][:, :, varying], axis=(1, 2))
 
 
-def difference_pca(D: Array) -> tuple[Array, Array]:
-    """Return PCA scores ``(n, n - 1)`` and variance ratios ``(n - 1,)`` of operators (3.6).
+def difference_pca(D: Array) -> tuple[Array, Array, Array]:
+    """PCA of vectorised operators ``(n, m, m)`` (3.6).
 
-    PCA of vectorised operators ``(n, m, m)``, with scores in their unit.
+    Returns
+    -------
+    score : float ndarray (n, n - 1)
+        In the unit of the operators: D_i is their mean plus the sum of score_ic component_c.
+    ratio : float ndarray (n - 1,)
+        Shares of the variance.
+    component : float32 ndarray (n - 1, m, m)
+        Of norm 1, or 0 without variance.
     """
     n, m = D.shape[:2]
     modes = gram_pca(D, np.ones(m))
     # gram_pca averages over the m rows, the norm of operators sums over them
-    score = modes.score * modes.standard_deviation * np.sqrt(m)  # (n, c)
+    unit = modes.standard_deviation * np.sqrt(m)  # (c,)
+    component = (modes.deformation / unit[:, None, None]).astype(np.float32)
     n_empty = n - 1 - len(modes.ratio)  # components without variance
-    return np.pad(score, ((0, 0), (0, n_empty))), np.pad(modes.ratio, (0, n_empty))
+    return (
+        np.pad(modes.score * modes.standard_deviation * np.sqrt(m), ((0, 0), (0, n_empty))),
+        np.pad(modes.ratio, (0, n_empty)),
+        np.pad(component, ((0, n_empty), (0, 0), (0, 0))),
+    )
 
 
 def median_shape(latent: xr.Dataset, eigenvalues: Array, *, norm: str = "h2") -> xr.Dataset:
@@ -112,8 +124,9 @@ def median_shape(latent: xr.Dataset, eigenvalues: Array, *, norm: str = "h2") ->
     Returns
     -------
     xarray.Dataset
-        `latent` with ``area_difference``, ``conformal_difference``, ``distance_to_limit``, the PCA
-        scores of both operators, and the attributes ``median`` (name of the shape) and ``norm``.
+        `latent` with ``area_difference``, ``conformal_difference``, ``distance_to_limit``,
+        ``distance_by_norm``, scores and components of the PCA of both operators, and the attributes
+        ``median`` (name of the shape) and ``norm``.
 
     See Also
     --------
@@ -123,20 +136,24 @@ def median_shape(latent: xr.Dataset, eigenvalues: Array, *, norm: str = "h2") ->
     Y, latent_eigenvalue = latent["latent_basis"].values, latent["latent_eigenvalue"].values
     area = area_differences(Y)
     conformal = conformal_differences(Y, np.asarray(eigenvalues, float), latent_eigenvalue)
-    distance = distance_to_identity(area, latent_eigenvalue, norm)
-    area_score, area_ratio = difference_pca(area)
-    conformal_score, conformal_ratio = difference_pca(conformal)
+    distances = {name: distance_to_identity(area, latent_eigenvalue, name) for name in NORMS}
+    distance = distances[norm]
+    area_score, area_ratio, area_component = difference_pca(area)
+    conformal_score, conformal_ratio, conformal_component = difference_pca(conformal)
     differences = dataset(
         area_difference=area,
         conformal_difference=conformal,
         distance_to_limit=distance,
+        distance_by_norm=np.stack(list(distances.values())),
         area_score=area_score,
         area_variance_ratio=area_ratio,
+        area_component=area_component,
         conformal_score=conformal_score,
         conformal_variance_ratio=conformal_ratio,
-    )
+        conformal_component=conformal_component,
+    ).assign_coords(norm=list(NORMS))
     median = str(latent["shape"].values[int(np.argmin(distance))])
-    return latent.assign(differences.data_vars).assign_attrs(latent.attrs, median=median, norm=norm)
+    return latent.assign(differences.variables).assign_attrs(latent.attrs, median=median, norm=norm)
 
 
 def near_ties(distance: Array, *, within: float = 0.05) -> list[int]:

@@ -278,8 +278,9 @@ def coarsen(
         A clean mesh with ``position`` and ``corner_vertex``.  It must be manifold and oriented.
         Boundaries and several components are allowed.
     n_coarse : int
-        Target number of vertices.  The result has between 95 % and 110 % of it.  A mesh with
-        hundreds of handles may need more if n_coarse is in the hundreds.  A mesh that has no more
+        Target number of vertices.  The result has between 95 % and 110 % of it, and usually 95 %,
+        as the rest is for samples that the topology needs.  A mesh with hundreds of handles may
+        need more if n_coarse is in the hundreds.  A mesh that has no more
         vertices than n_coarse is returned unchanged.
     wrap : bool
         Remesh an alpha wrap of the mesh.  This is meant for scans whose interior is irrelevant, and

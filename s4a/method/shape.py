@@ -28,7 +28,7 @@ from s4a.method.deform import smoother
 from s4a.method.remesh import laplacian
 from s4a.method.spectral import Diffusion, project, unit_area, unit_mass
 from s4a.options import N_CENTRAL, N_SAMPLES
-from s4a.schema import Array
+from s4a.schema import Array, require
 
 # of one standard deviation of a field, relative to positions times POSITION_WEIGHT: as much as 2 %
 # of sqrt(area).  With twice the weight, labels of cortex are transferred less accurately
@@ -268,16 +268,7 @@ class Shape:
 
         In SCALABLE the local functions, with rows of sum 1.
         """
-        if self.is_sampled:
-            row, column, weight = (
-                self.coarse[f"local_{part}"].values for part in ("vertex", "sample", "weight")
-            )
-            shape = self.coarse.sizes["original_vertex"], self.coarse.sizes["vertex"]
-            return sp.csr_matrix((weight, (row, column)), shape)
-        corners = self.coarse["coarse_vertex"].values  # (n, 3)
-        weights = self.coarse["coarse_weight"].values  # (n, 3), rows of sum 1
-        rows = np.arange(len(corners))
-        return interpolation_matrix(corners, rows, weights, self.coarse.sizes["vertex"])
+        return projection_operator(self.coarse)
 
     @cached_property
     def landmarks(self) -> tuple[list[str], sp.csr_matrix]:
@@ -386,6 +377,50 @@ class Shape:
         else:
             near = self.coarse["coarse_weight"].values.max(1)
         return np.flatnonzero(near >= np.partition(near, -n)[-n])
+
+
+def projection_operator(coarse: xr.Dataset) -> sp.csr_matrix:
+    """Return the projection operator U of a low-resolution mesh as a sparse matrix (4.1, eq. 4, 7).
+
+    Parameters
+    ----------
+    coarse : xarray.Dataset
+        Mesh of :func:`s4a.coarsen`, such as ``study["coarse/brain_01"]``.
+
+    Returns
+    -------
+    scipy.sparse.csr_matrix (n, n_coarse)
+        U f are the values of a function f ``(n_coarse,)`` at the n original vertices.  Each row has
+        three barycentric weights of sum 1; with ``method="scalable"`` the values of the local
+        functions.
+
+    Raises
+    ------
+    ValueError
+        If the mesh has no U.
+
+    See Also
+    --------
+    s4a.coarsen : Compute the low-resolution mesh and U.
+
+    Examples
+    --------
+    The basis U Phi at full resolution:
+
+    >>> import s4a
+    >>> coarse = s4a.synthetic.example_study()["coarse/brain_01"]
+    >>> U = s4a.projection_operator(coarse)
+    >>> U.shape, (U @ coarse["eigenfunction"].values).shape
+    ((200, 95), (200, 10))
+    """
+    if "local_weight" in coarse:
+        entries = (coarse[f"local_{part}"].values for part in ("weight", "vertex", "sample"))
+        weight, row, column = entries
+        shape = coarse.sizes["original_vertex"], coarse.sizes["vertex"]
+        return sp.csr_matrix((weight, (row, column)), shape)
+    require(coarse, "coarse_vertex", "coarse_weight", what="low-resolution mesh")
+    corners, weights = coarse["coarse_vertex"].values, coarse["coarse_weight"].values  # (n, 3)
+    return interpolation_matrix(corners, np.arange(len(corners)), weights, coarse.sizes["vertex"])
 
 
 def vertices_of_landmarks(mesh: xr.Dataset) -> dict[str, int]:

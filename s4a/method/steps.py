@@ -13,7 +13,12 @@ from threadpoolctl import threadpool_limits
 
 from s4a.geometry.align import RigidTransform, align, relative_transform
 from s4a.method import fmap, network
-from s4a.method.alignment import align_all, pair_transform, transform_onto
+from s4a.method.alignment import (
+    align_all,
+    alignment_residual,
+    pair_transform,
+    transform_onto,
+)
 from s4a.method.initial_map import initial_map, map_after_alignment
 from s4a.method.latent import (
     DENSE_ITERATIONS,
@@ -118,6 +123,7 @@ def map_pairs(
     initial_refinement: bool = True,
     n_samples: int = N_SAMPLES,
     alignment: str = "search",
+    keep_descriptors: bool = False,
 ) -> xr.Dataset:
     """Compute the initial maps of some pairs, in both directions (4.1, steps 3 and 4).
 
@@ -136,13 +142,16 @@ def map_pairs(
         vertices.
     alignment : {"search", "icp", "given"}
         See :class:`s4a.Options`.
+    keep_descriptors : bool
+        Whether to return the descriptors of the landmarks.
 
     Returns
     -------
     xarray.Dataset
         ``source(pair)``, ``target(pair)`` and ``fmap_initial``; ``fmap_fitted``, the maps before
-        the refinement; ``pair_rotation``, ``pair_translation``, the transform of ICP; with
-        landmarks ``landmark_of_source(pair, landmark)`` and ``landmark_of_target``.
+        the refinement; ``pair_rotation``, ``pair_translation`` and ``pair_residual`` of ICP; with
+        landmarks ``landmark_of_source(pair, landmark)``, ``landmark_of_target``,
+        ``descriptor_energy(pair)`` and ``laplacian_energy(pair)``.
     """
     options: dict[str, Any] = {
         "k_init": k_init,
@@ -151,6 +160,7 @@ def map_pairs(
     }
     options["n_samples"] = n_samples
     rows: list[tuple[Any, ...]] = []
+    fits: list[xr.Dataset] = []
     for a, b in pairs:
         M, N = bases[a], bases[b]
         R, t = pair_transform(M, N, relative_transform(transforms[a], transforms[b]), alignment)
@@ -159,15 +169,18 @@ def map_pairs(
         back = map_after_alignment(N, M, (R_back, t_back), **options)
         if forth.name != init:  # large pose difference: both directions must match the same limbs
             back = back._replace(C=fmap.refine_once(N, M, forth.C.T), fitted=forth.C.T)
-        rows.append((a, b, forth.C, forth.fitted, R, t, forth.landmarks))
-        rows.append((b, a, back.C, back.fitted, R_back, t_back, back.landmarks))
+        residual = alignment_residual(M, N, (R, t))
+        rows.append((a, b, forth.C, forth.fitted, R, t, residual, forth.landmarks))
+        rows.append((b, a, back.C, back.fitted, R_back, t_back, residual, back.landmarks))
+        fits += [one.fit_to_landmarks(keep_descriptors) for one in (forth, back)]
     names = ("source", "target", "fmap_initial", "fmap_fitted", "pair_rotation", "pair_translation")
     *columns, marks = map(np.array, zip(*rows, strict=True))
-    maps = dataset(None, **dict(zip(names, columns, strict=True)))
+    maps = dataset(None, **dict(zip((*names, "pair_residual"), columns, strict=True)))
     if init != "landmarks":
         return maps
     # marks (p, 2, landmarks)
-    return maps.merge(dataset(landmark_of_source=marks[:, 0], landmark_of_target=marks[:, 1]))
+    marked = dataset(landmark_of_source=marks[:, 0], landmark_of_target=marks[:, 1])
+    return maps.merge(marked).merge(xr.concat(fits, dim="pair"))
 
 
 def build_network(
@@ -213,7 +226,9 @@ def build_network(
         - ``landmark_of_source(pair, landmark)`` and ``landmark_of_target``: vertices of the
           landmarks, with ``init="landmarks"``;
         - ``icp_rotation(shape, xyz, xyz_2)`` and ``icp_translation(shape, xyz)``: rigid transform
-          of each shape onto the shape that the attribute ``reference`` names.
+          of each shape onto the shape that the attribute ``reference`` names;
+        - ``pair_residual(pair)`` and ``icp_residual(shape)``: residuals of both alignments;
+        - ``spectral_distance(shape, shape_2)``: distances that chose the pairs and the reference.
 
     Raises
     ------
@@ -274,15 +289,24 @@ def build_network(
         n_samples=n_samples,
         alignment=alignment,
     )
-    return with_transforms(maps, transforms, reference)
+    residuals = [alignment_residual(bases[n], bases[reference], transforms[n]) for n in names]
+    return with_transforms(maps, transforms, reference, residuals, distance)
 
 
 def with_transforms(
-    maps: xr.Dataset, transforms: dict[str, RigidTransform], reference: str
+    maps: xr.Dataset,
+    transforms: dict[str, RigidTransform],
+    reference: str,
+    residuals: Sequence[float],
+    distance: np.ndarray,
 ) -> xr.Dataset:
-    """Add the rigid transforms of the shapes onto the `reference` to a network."""
+    """Add to a network the transforms onto the `reference`, their residuals, spectral distances."""
     R, t = (np.stack(values) for values in zip(*transforms.values(), strict=True))
-    alignment = dataset(icp_rotation=R, icp_translation=t).assign_coords(shape=list(transforms))
+    alignment = dataset(
+        icp_rotation=R, icp_translation=t, icp_residual=residuals, spectral_distance=distance
+    )
+    names = list(transforms)
+    alignment = alignment.assign_coords(shape=names, shape_2=names)
     return maps.merge(alignment).assign_attrs(reference=reference)
 
 
@@ -294,6 +318,7 @@ def refine_network(
     step: int = 5,
     n_latent: int | None = None,
     weights: str = "cycles",
+    isometric: bool = False,
     n_samples: int = N_SAMPLES,
     dense_iterations: int = DENSE_ITERATIONS,
     norm: str = "h2",
@@ -309,7 +334,7 @@ def refine_network(
         Name -> low-resolution mesh with its spectrum.
     initial : xarray.Dataset
         Network of :func:`build_network`.
-    k, step, n_latent, weights, n_samples, dense_iterations, norm, keep_iterations
+    k, step, n_latent, weights, isometric, n_samples, dense_iterations, norm, keep_iterations
         Options of Consistent ZoomOut and of the median shape.  :class:`s4a.Options` describes them.
     n_jobs : int
         Number of threads, as in joblib: -1 for all cores.  The result does not depend on it.
@@ -321,13 +346,16 @@ def refine_network(
     xarray.DataTree
         The refined network, with the nodes
 
-        - ``/network``: the refined maps ``fmap``, their ``weight``, and the errors ``cycle_error``
-          and ``cycle_error_initial`` of the refined and the initial maps;
+        - ``/network``: the refined maps ``fmap``, their ``weight``, the errors ``cycle_error`` and
+          ``cycle_error_initial`` of the refined and the initial maps, and
+          ``iteration_weight(iteration, pair)`` and ``iteration_cycle_error`` of every iteration;
         - ``/latent``: ``latent_basis``, ``latent_eigenvalue``, shape differences and
           ``distance_to_limit(shape)``, see :func:`s4a.method.median.median_shape`.  The attribute
           ``median`` is the name of the median shape;
-        - ``/iterations/k_020`` and so on, with `keep_iterations`: ``fmap``, ``latent_basis`` and
-          ``latent_eigenvalue`` for every size of the maps.
+        - ``/iterations/k_020`` and so on, with `keep_iterations`: ``fmap``, ``latent_basis``,
+          ``latent_eigenvalue`` and the matches of eq. 3 for every size of the maps:
+          ``matched_source`` of ``matched_target``, of all maps one after the other, as many of each
+          as ``matched_count(pair)`` says.
 
     Raises
     ------
@@ -381,13 +409,31 @@ def refine_network(
         raise ValueError(
             f"k must be at least {C_initial.shape[1]}, the size of the initial maps; found {k}"
         )
-    iterations = {}
+    iterations: dict[str, xr.Dataset] = {}
+    history: list[tuple[int, np.ndarray, np.ndarray]] = []
 
-    def keep(C, Y, latent_eigenvalue):
-        result = dataset(
-            fmap=C.astype(np.float32), latent_basis=Y, latent_eigenvalue=latent_eigenvalue
+    def keep(C, Y, latent_eigenvalue, weight, error):
+        history.append((len(Y[0]), weight, error))
+        if keep_iterations:
+            result = dataset(
+                fmap=C.astype(np.float32),
+                latent_basis=Y,
+                latent_eigenvalue=latent_eigenvalue,
+                iteration_weight=weight,
+                iteration_cycle_error=error,
+            )
+            result = result.merge(initial[["source", "target"]]).assign_coords(shape=names)
+            iterations[f"iterations/k_{len(Y[0]):03d}"] = result.drop_attrs(deep=False)
+
+    def keep_matches(matches, vertices):
+        node = next(reversed(iterations))
+        iterations[node] = iterations[node].merge(
+            dataset(
+                matched_source=np.concatenate(matches).astype(np.int32),
+                matched_target=np.concatenate(vertices).astype(np.int32),
+                matched_count=list(map(len, matches)),
+            )
         )
-        iterations[f"iterations/k_{len(Y[0]):03d}"] = result.assign_coords(shape=names)
 
     with threadpool_limits(1):
         C, weight, _, Y, latent_eigenvalue = consistent_zoomout(
@@ -399,14 +445,20 @@ def refine_network(
             step=step,
             n_latent=n_latent,
             weights=weights,
+            isometric=isometric,
             samples=[basis.sample_vertices_of(n_samples) for basis in bases],
             dense_iterations=dense_iterations,
             n_jobs=n_jobs,
             progress=progress,
-            keep=keep if keep_iterations else None,
+            keep=keep,
+            keep_matches=keep_matches if keep_iterations else None,
         )
     cycles = network.three_cycles(source.tolist(), target.tolist())
+    iteration_size, iteration_weight, iteration_error = map(np.array, zip(*history, strict=True))
     refined = dataset(
+        iteration_size=iteration_size,
+        iteration_weight=iteration_weight,
+        iteration_cycle_error=iteration_error,
         fmap=C.astype(np.float32),
         weight=weight,
         cycle_error=network.cycle_errors(C, cycles, k=C_initial.shape[1]),

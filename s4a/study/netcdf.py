@@ -6,9 +6,9 @@ dims and types of every group, and the values of texts and small variables.  The
 numeric variables have Fletcher-32 checksums, which HDF5 verifies whenever it reads them; its
 metadata has checksums since version 1.10.
 
-A study may be untrusted.  HDF5 follows links into other files, reads values from them (external
-storage, virtual datasets) and unpacks compressed data of any size.  :func:`open_hdf5` and
-:func:`values_of` refuse all of this.
+Files may be untrusted.  HDF5 follows links into other files, reads values from them (external
+storage, virtual datasets) and unpacks compressed data of any size.  :func:`open_hdf5`, the only
+function that opens HDF5 files for reading, and :func:`values_of` refuse all of this.
 """
 
 import json
@@ -34,7 +34,8 @@ from s4a.schema import check_indices
 GROUP, CONTENTS = "s4a", "s4a/contents_3"  # with the number of the format
 SMALL = 100  # largest variable whose values are in the contents
 COMPRESSED = 1000  # smallest variable that is compressed on request
-LARGEST_TEXT = 2**31  # bytes of memory for the texts of a variable
+LARGEST_TEXT = 2**28  # bytes of memory for the texts of a variable
+LEAST, RATIO = 2**26, 200  # bytes that are always read; beyond, the ratio of these to those stored
 FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
 NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable."  # text of netCDF
 
@@ -72,37 +73,71 @@ def check_regular(path: Path | str) -> None:
 @contextmanager
 def open_hdf5(path: Path | str) -> Iterator[h5f.FileID]:
     """Open an untrusted HDF5 file; links, pipes, devices and folders are refused."""
-    with damage_named(path):
-        check_regular(path)
-        file = h5f.open(os.fsencode(path), h5f.ACC_RDONLY)
-        try:
-            yield file
-        finally:
-            file.close()
+    check_regular(path)
+    file = h5f.open(os.fsencode(path), h5f.ACC_RDONLY)
+    try:
+        yield file
+    finally:
+        file.close()
 
 
-def values_of(file: h5f.FileID, name: str) -> np.ndarray:
-    """Read the numbers of a variable; OSError unless they are stored in the file itself."""
+def stored_in(file: h5f.FileID, name: str) -> Any:
+    """Return the low-level group or dataset of a name; OSError if a part of the name is a link."""
     stored: Any = file
     for part in name.encode().split(b"/"):
         if stored.links.get_info(part).type != h5l.TYPE_HARD:
             raise OSError(f"{name} is a link, and links are not followed")
         stored = h5o.open(stored, part)
+    return stored
+
+
+def values_of(file: h5f.FileID, name: str) -> np.ndarray:
+    """Read the numbers of a variable; OSError unless they are stored in the file itself."""
+    stored = stored_in(file, name)
     if not isinstance(stored, h5d.DatasetID):
         raise OSError(f"{name} is not a variable")
+    check_contained(stored, name)
+    if stored.dtype.kind not in "iuf":
+        raise OSError(f"{name} needs numbers, found {stored.dtype}")
+    values = np.empty(stored.shape, stored.dtype)
+    stored.read(h5s.ALL, h5s.ALL, values)
+    return values
+
+
+def check_contained(stored: h5d.DatasetID, name: str) -> None:
+    """Raise OSError unless the values of a dataset are in its file, and not too many for it."""
     plan = stored.get_create_plist()
     if plan.get_layout() == h5d.VIRTUAL or plan.get_external_count():
         raise OSError(f"{name} has its values in other files, which are not read")
     if not {plan.get_filter(i)[0] for i in range(plan.get_nfilters())} <= FILTERS:
-        raise OSError(f"{name} has a filter that files of a study do not use")
-    if stored.dtype.kind not in "iuf":
-        raise OSError(f"{name} needs numbers, found {stored.dtype}")
+        raise OSError(f"{name} has a filter that is not deflate, shuffle or Fletcher-32")
     # Deflate packs at most 1032 to 1: check before memory is allocated
-    if math.prod(stored.shape) * stored.dtype.itemsize > 1032 * stored.get_storage_size():
+    size, packed = math.prod(stored.shape) * stored.dtype.itemsize, stored.get_storage_size()
+    if size > 1032 * packed:
         raise OSError(f"{name} is incomplete")
-    values = np.empty(stored.shape, stored.dtype)
-    stored.read(h5s.ALL, h5s.ALL, values)
-    return values
+    check_size(name, size, packed)
+
+
+def check_size(name: str, size: int, packed: int) -> None:
+    """Raise OSError if `size` bytes of values are too many for those that are stored."""
+    if size > max(LEAST, RATIO * packed):
+        raise OSError(f"{name} needs {size} bytes of memory, but has {packed} in the file")
+
+
+def open_plain(path: Path | str) -> xr.Dataset:
+    """Open a file as other netCDF programs do, after a check that all values are in it."""
+    with open_hdf5(path) as file:
+        links: list[tuple[bytes, int]] = []  # an error within `visit` would be lost
+        file.links.visit(lambda name, info: links.append((name, info.type)), info=True)
+        for name, kind in links:
+            if kind != h5l.TYPE_HARD:
+                raise OSError(f"{name.decode()} is a link, and links are not followed")
+            stored = h5o.open(file, name)
+            if isinstance(stored, h5d.DatasetID):
+                scale = h5py.Dataset(stored).attrs.get("NAME", b"")
+                if stored.get_storage_size() or not scale.startswith(NO_VARIABLE.encode()):
+                    check_contained(stored, name.decode())
+    return xr.open_dataset(path, engine="h5netcdf", decode_times=False)
 
 
 # ---- reading a file of a study
@@ -115,17 +150,26 @@ def opened(path: Path | str) -> Iterator[tuple[h5f.FileID, bytes, dict[str, Any]
     The dict has for each group, by its path ("" for the root), its attributes ``attrs``, its
     ``variables`` and the names of its coordinates ``coords``.
     """
-    with open_hdf5(path) as file:
+    with damage_named(path), open_hdf5(path) as file:
         if not file.links.exists(GROUP.encode()):
             raise OSError(f"it has no /{CONTENTS}: another version of s4a wrote it")
         text = values_of(file, CONTENTS).tobytes()
-        yield file, text, json.loads(text)
+        nodes = json.loads(text)
+        entries = [entry for node in nodes.values() for entry in node["variables"].values()]
+        size = sum(math.prod(e["shape"]) * np.dtype(e["dtype"]).itemsize for e in entries)
+        check_size("it", size, os.stat(path).st_size)
+        yield file, text, nodes
 
 
 def values_in(file: h5f.FileID, path: str, entry: Mapping[str, Any]) -> np.ndarray:
     """Read a variable of an open file, given its entry in the contents."""
     dtype = type_of(entry)
-    values = np.array(entry["values"], object) if "values" in entry else values_of(file, path)
+    if "values" in entry:
+        values = np.array(entry["values"], object)
+    elif stored_in(file, path).shape != tuple(entry["shape"]):
+        raise OSError(f"{path} has another shape than its contents say")
+    else:
+        values = values_of(file, path)
     if dtype.kind == "U":  # NumPy pads each text to the longest
         if 4 * max(map(len, values.flat), default=0) * values.size > LARGEST_TEXT:
             raise OSError(f"{path} has more text than its file")
@@ -158,7 +202,7 @@ class Stored(BackendArray):
 
     def part(self, key: Any) -> np.ndarray:
         """Read the selection from the file; ValueError if the file was written again."""
-        with open_hdf5(self.file) as file:
+        with damage_named(self.file), open_hdf5(self.file) as file:
             same = os.stat(self.file).st_mtime_ns == self.written
             # a repeated run may write the same contents
             if same := same or values_of(file, CONTENTS).tobytes() == self.stamp:

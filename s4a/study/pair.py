@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from s4a.input.collection import Mesh, as_mesh
 from s4a.method import fmap
-from s4a.method.alignment import align_onto, less_confident
+from s4a.method.alignment import align_onto, alignment_residual, less_confident
 from s4a.method.initial_map import initial_map
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.register import refine_at_full_resolution, register
@@ -38,8 +38,9 @@ def match_pair(
         uses the defaults of S4A.
     **options
         ``n_coarse, k_init, k, step, init, initial_refinement, full_resolution_iterations, refine,
-        articulated, refined_eigenfunctions, alignment, area_weighted, n_projected, method, seed``
-        or ``rng``.  :class:`s4a.Options` describes them and has their defaults.
+        articulated, refined_eigenfunctions, alignment, area_weighted, n_projected, method,
+        keep_iterations, seed`` or ``rng``.  :class:`s4a.Options` describes them and has their
+        defaults.
 
     Returns
     -------
@@ -54,8 +55,12 @@ def match_pair(
         - ``fmap(eigenpair_target, eigenpair_source)``: functional map after ZoomOut;
         - ``fmap_initial``: initial functional map;
         - ``fmap_fitted``: initial functional map before its ZoomOut iteration;
-        - ``landmark_of_source(landmark)`` and ``landmark_of_target``: vertices of the landmarks, if
-          the initial map was fitted to landmarks.
+        - ``landmark_of_source(landmark)`` and ``landmark_of_target``: vertices of the landmarks,
+          and ``descriptor_energy`` and ``laplacian_energy``, the terms of the fit, if the initial
+          map was fitted to landmarks;
+        - ``iteration_fmap(iteration, eigenpair_target, eigenpair_source)`` and
+          ``iteration_match(iteration, low_vertex)``: map and match of every iteration of ZoomOut,
+          with ``keep_iterations=True``.
 
         :func:`s4a.method.register.register` describes the other variables.  The attributes are
 
@@ -149,7 +154,9 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
         initial_refinement=initial_refinement,
         search=True,
     )
-    C, match = fmap.zoomout(M, N, initial.C, k, step=options.step)
+    kept: list[tuple[np.ndarray, np.ndarray]] = []
+    keep = (lambda *pair: kept.append(pair)) if options.keep_iterations else None
+    C, match = fmap.zoomout(M, N, initial.C, k, step=options.step, keep=keep)
     for _ in range(options.full_resolution_iterations):
         C = refine_at_full_resolution(
             source, target, C, source.full.Phi if source.has_refined_eigenfunctions else None
@@ -162,9 +169,21 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     if aligned.ambiguity:
         log.warning("%s", aligned.ambiguity)
     registration = less_confident(registration, len(aligned.fits))
-    maps = dataset(fmap=C, fmap_initial=initial.C, fmap_fitted=initial.fitted)
+    residual = alignment_residual(M, N, transform)
+    maps = dataset(
+        fmap=C, fmap_initial=initial.C, fmap_fitted=initial.fitted, icp_residual=residual
+    )
     if initial.landmarks is not None:
         at_source, at_target = initial.landmarks
         maps = maps.merge(dataset(landmark_of_source=at_source, landmark_of_target=at_target))
+        maps = maps.merge(initial.fit_to_landmarks(options.keep_iterations))
+    if kept:
+        sizes = [len(c) for c, _ in kept]
+        padded = [np.pad(c, (0, k - len(c)), constant_values=np.nan) for c, _ in kept]
+        matches = np.stack([match for _, match in kept]).astype(np.int32)
+        iterations = dataset(
+            iteration_size=sizes, iteration_fmap=np.stack(padded), iteration_match=matches
+        )
+        maps = maps.merge(iterations)
     attrs = {"initial_map": initial.name, "ambiguity": aligned.ambiguity}
     return registration.assign_attrs(attrs), maps

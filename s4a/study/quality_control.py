@@ -124,8 +124,9 @@ def exclude_flagged(
 ) -> tuple[Flags, Keys, Keys, list[str]]:
     """Split the shapes into those of the network and flagged ones, excluded from it.
 
-    Shapes with fewer eigenfunctions than most others fail.  If fewer than two shapes are not
-    flagged, there is no reference to compare with, and all flags are lifted.
+    Shapes with fewer eigenfunctions than most others fail.  All flags are lifted with
+    ``quality_control="off"``, and if fewer than two shapes are not flagged, since there is no
+    reference to compare with.
 
     Returns
     -------
@@ -134,13 +135,14 @@ def exclude_flagged(
         Keys of the low-resolution meshes of both.
     remarks : list of str
     """
+    flags = unflagged(flags) if options.quality_control == "off" else flags
     count = {n: len(arrays(run.folder / f"coarse/{n}.nc", "eigenvalue")[0]) for n in coarse}
     is_flagged = {n: any(flag.flagged for flag in flags.get(n, [])) for n in coarse}
     # a template that the user names is trusted
     trusted = [n for n in coarse if n == options.template or not is_flagged[n]]
     remarks = []
     if len(trusted) < 2:
-        flags = {n: [flag._replace(flagged=False) for flag in flags.get(n, [])] for n in flags}
+        flags = unflagged(flags)
         if len(coarse) > 1:
             remarks = [
                 f"{len(coarse) - len(trusted)} of {len(coarse)} shapes are flagged, too many to "
@@ -173,13 +175,16 @@ def exclude_ambiguous(
 ) -> tuple[Flags, Keys, Keys, list[str]]:
     """Split the shapes of the network into those with one pose and ambiguous ones.
 
-    If half of the shapes or more are ambiguous, none is excluded.
+    If half of the shapes or more are ambiguous, none is excluded, nor with
+    ``quality_control="off"``.
 
     Returns
     -------
     flags, coarse, excluded, remarks : see :func:`exclude_flagged`
     """
     flags = flag_poses(run, coarse, flags)
+    if options.quality_control == "off":
+        return unflagged(flags), coarse, {}, []
     ambiguous = [n for n in coarse if any(flag.kind == POSE for flag in flags.get(n, []))]
     excluded = {n: coarse[n] for n in ambiguous if n != options.template}
     if 2 * len(excluded) >= len(coarse):
@@ -190,6 +195,11 @@ def exclude_ambiguous(
         )
         return flags, coarse, {}, [remark]
     return flags, {n: coarse[n] for n in coarse if n not in excluded}, excluded, []
+
+
+def unflagged(flags: Flags) -> Flags:
+    """Return the flags as warnings, which exclude no shape."""
+    return {name: [flag._replace(flagged=False) for flag in flags[name]] for name in flags}
 
 
 def usable_k(counts: Sequence[int], k: int) -> int:

@@ -18,10 +18,12 @@ from s4a.input.annotations import labels_of_mesh, read_scalars, with_features
 from s4a.input.chirality import mirror_image
 from s4a.input.clean import check_range, clean
 from s4a.input.collection import read_shape
+from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.landmarks import guides_of, with_landmarks
 from s4a.method import steps
-from s4a.method.alignment import align_voted, less_confident, voters_of
+from s4a.method.alignment import align_voted, alignment_residual, less_confident, voters_of
 from s4a.method.latent import out_of_sample_latent
+from s4a.method.network import spectral_distance
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.shape import Shape, features_of
 from s4a.options import Options
@@ -39,9 +41,9 @@ def clean_shape(
 ) -> xr.Dataset:
     """Read and clean a file, or clean a mesh in memory if necessary.
 
-    `also` may have ``guides``, files of landmarks and fields with the keys of their contents, and
-    ``reflected`` to mirror the shape.  Raises OSError if a file has changed since its key was
-    computed.
+    `also` may have ``guides``, files of landmarks and fields with the keys of their contents,
+    ``system``, attributes of the coordinate system to convert to, and ``reflected`` to mirror the
+    shape.  Raises OSError if a file has changed since its key was computed.
     """
     mesh = cleaned(source, content, cleaning)
     guides = also.get("guides", NO_GUIDES)
@@ -55,6 +57,8 @@ def clean_shape(
             fields[name] = read_scalars(file, name)
     if fields:
         mesh = with_features(mesh, fields)
+    if "system" in also:
+        mesh = in_axes(mesh, CoordinateSystem.of(also["system"]))
     return mirror_image(mesh) if "reflected" in also else mesh
 
 
@@ -73,12 +77,15 @@ def cleaned(source: str | xr.Dataset, content: str, cleaning: dict[str, Any]) ->
     if isinstance(source, str):
         with unchanged(source, content):
             return read_shape(source, **cleaning)
+    source = with_system(source, cleaning["coordinate_system"], cleaning["unit"])
     if "file_vertex" in source:
         check_range(*as_arrays(source))
         area = float(triangle_areas(*as_arrays(source)).sum())
         mesh = source.assign_attrs({"status": "ok", "reason": "", "area": area} | source.attrs)
     else:
-        mesh = clean(source, **{name: cleaning[name] for name in cleaning if name != "label"})
+        mesh = clean(
+            source, **{name: cleaning[name] for name in ("components", "strict", "close_holes")}
+        )
         mesh = guided(mesh, source)
     return in_unit(mesh, source.attrs.get("unit"))
 
@@ -157,16 +164,22 @@ def align_shape(folder: Path, name: str, reference: str, alignment: str) -> xr.D
     target = steps.basis_in(study, reference)
     basis = target if name == reference else steps.basis_in(study, name)
     found = align_voted(name, basis, target, reference, alignment, voters)
-    attrs = {"reference": reference, "n_poses": len(found.fits), "ambiguity": found.ambiguity}
+    residual = alignment_residual(basis, target, found.transform)
+    attrs: dict[str, Any] = {"reference": reference, "residual": residual}
+    attrs |= {"n_poses": len(found.fits), "ambiguity": found.ambiguity}
     return dataset(attrs, rotation=found.R, translation=found.t)
 
 
-def map_pairs(folder: Path, pairs: list[Any], k_init: int, options: dict[str, Any]) -> xr.Dataset:
+def map_pairs(
+    folder: Path, pairs: list[Any], k_init: int, options: dict[str, Any], keep: bool
+) -> xr.Dataset:
     """Compute initial maps of some pairs, in both directions (4.1, steps 3 and 4)."""
     study, names = Folder(folder), sorted({name for pair in pairs for name in pair})
     bases = {name: steps.basis_in(study, name) for name in names}
     transforms = {name: steps.transform_in(study, name) for name in names}
-    return steps.map_pairs(bases, transforms, pairs, k_init=k_init, **options)
+    return steps.map_pairs(
+        bases, transforms, pairs, k_init=k_init, keep_descriptors=keep, **options
+    )
 
 
 def consistent_maps(
@@ -175,10 +188,12 @@ def consistent_maps(
     """Refine the network by Consistent ZoomOut (4.2): ``/network`` and ``/latent``."""
     study = Folder(run.folder)
     transforms = {name: steps.transform_in(study, name) for name in names}
-    reference = study[f"network/alignment_{names[0]}"].attrs["reference"]
-    initial = steps.with_transforms(initial, transforms, reference)
+    alignments = [study[f"network/alignment_{name}"].attrs for name in names]
+    reference, residuals = alignments[0]["reference"], [a["residual"] for a in alignments]
     coarse = {name: study[f"coarse/{name}"] for name in names}
     k_init = initial.sizes["eigenpair_source_initial"]
+    distance = spectral_distance([c["eigenvalue"].values[:k_init] for c in coarse.values()])
+    initial = steps.with_transforms(initial, transforms, reference, residuals, distance)
     k = min(options.k, *(mesh.sizes["eigenpair"] for mesh in coarse.values()))
     bar = run.show("consistent ZoomOut", k - k_init)
     return steps.refine_network(
@@ -188,6 +203,7 @@ def consistent_maps(
         step=options.step,
         n_latent=options.n_latent,
         weights=options.weights,
+        isometric=options.isometric,
         n_samples=options.n_samples,
         dense_iterations=options.dense_iterations,
         norm=options.norm,

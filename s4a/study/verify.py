@@ -7,7 +7,7 @@ import xarray as xr
 
 from s4a.schema import HOLDS, dataset
 from s4a.study.contents import kind_of
-from s4a.study.netcdf import GROUP, damage_named, open_file, open_hdf5
+from s4a.study.netcdf import GROUP, damage_named, open_file, open_hdf5, open_plain
 from s4a.study.store import STAGES, check_is_study
 from s4a.study.tree import Reader, excluded_of
 
@@ -110,7 +110,7 @@ def check_netcdf(path: Path, data: xr.Dataset) -> None:
         names = {name.decode() for name in file} - {GROUP}
     if names != {*data.variables, *data.sizes}:
         raise OSError(f"variables and contents differ: {names ^ set(data.variables)}")
-    with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored:
+    with open_plain(path) as stored:
         if not stored.identical(data):
             raise OSError("the contents differ from the HDF5 data")
 

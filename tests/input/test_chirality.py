@@ -78,6 +78,17 @@ def test_mirror_symmetric_shapes_are_left_as_they_are_with_a_remark():
     assert "mirrored no shape: the shapes are too symmetric" in remark
 
 
+def test_a_shape_that_fits_as_well_as_it_is_is_not_mirrored(chiral):
+    comparisons = plausibility.examine(chiral, intersections=False)
+    alike = comparisons["s4"].assign(fit_mirrored=comparisons["s4"]["fit"])
+    comparisons |= {"s4": alike}
+    flags, _ = plausibility.find_warnings({name: {} for name in comparisons}, comparisons)
+    assert [n for n in flags if "mirrored" in {flag.kind for flag in flags[n]}] == ["s1"]
+    names, (remark,) = mirrored_shapes(comparisons)
+    assert names == ["s1"]
+    assert "cannot determine the side of s4" in remark
+
+
 def test_a_shape_with_weak_evidence_is_named_and_left_as_it_is(chiral):
     comparisons = plausibility.examine(chiral, intersections=False)
     weak = comparisons["s4"].assign(chirality=0.1 * comparisons["s4"]["chirality"])

@@ -139,6 +139,72 @@ def test_what_is_no_such_volume_is_refused(tmp_path, values, label, why):
         read_volume(path, label)
 
 
+def nrrd(path, values, affine, encoding="gzip", **changed):
+    """Write what 3D Slicer writes, in LPS; `changed` replaces fields, or drops them if None."""
+    lps = np.diag([-1, -1, 1, 1]) @ affine
+    fields = {
+        "type": "unsigned char",
+        "dimension": "3",
+        "space": "left-posterior-superior",
+        "sizes": " ".join(map(str, values.shape)),
+        "space directions": " ".join("({},{},{})".format(*axis) for axis in lps[:3, :3].T),
+        "kinds": "domain domain domain",
+        "encoding": encoding,
+        "space origin": "({},{},{})".format(*lps[:3, 3]),
+    } | changed
+    head = "".join(f"{name}: {text}\n" for name, text in fields.items() if text is not None)
+    body = values.astype(np.uint8).tobytes(order="F")
+    body = gzip.compress(body) if encoding == "gzip" else body
+    path.write_bytes(f"NRRD0004\n# a comment\n{head}Segment0_ID:=spleen\n\n".encode() + body)
+    return path
+
+
+def test_other_files_of_the_same_volume_give_the_same_surface(tmp_path):
+    values = 17 * ball(middle=[13, 15, 14])[0].astype(np.uint8)
+    X, T, _ = read_volume(write(tmp_path / "a.nii", values), 17)
+    scaled = nibabel.Nifti1Image(values + 0.0, AFFINE)
+    scaled.set_data_dtype(np.int16)  # with a slope, as nibabel stores floats
+    scaled.to_filename(tmp_path / "scaled.nii.gz")
+    files = {
+        "two.nii": write(tmp_path / "two.nii", values, kind=nibabel.Nifti2Image),
+        "a.seg.nrrd": nrrd(tmp_path / "a.seg.nrrd", values, AFFINE),
+        "raw.nrrd": nrrd(tmp_path / "raw.nrrd", values, AFFINE, "raw", type="uint8_t"),
+        "float.nii": write(tmp_path / "float.nii", values.astype(np.float32)),
+        "scaled.nii.gz": tmp_path / "scaled.nii.gz",
+    }
+    for name, path in files.items():
+        Y, S, attrs = read_volume(path, 17)
+        np.testing.assert_allclose(Y, X, atol=1e-4, err_msg=name)
+        np.testing.assert_array_equal(S, T)
+        assert attrs["coordinate_system"] == "RAS"
+        assert ("were rounded" in attrs.get("note", "")) == (name == "scaled.nii.gz")
+    _, _, attrs = read_volume(nrrd(tmp_path / "b.nrrd", values, AFFINE, space=None), 17)
+    assert "no orientation" in attrs["note"]
+
+
+@pytest.mark.parametrize(
+    "changed, why",
+    [
+        ({"sizes": "2 30 30 30"}, "three sizes expected.*may overlap.*label map"),
+        ({"sizes": "30 30 300"}, "bytes of voxels"),
+        ({"type": "block"}, "numbers expected, found the type block"),
+        ({"data file": "a.raw"}, "voxels in the same file, expected"),
+        ({"encoding": "bzip2"}, "raw or gzip expected, found bzip2"),
+    ],
+)
+def test_an_nrrd_file_that_is_no_label_volume_is_refused(tmp_path, changed, why):
+    with pytest.raises(ValueError, match=rf"a\.nrrd.*{why}"):
+        read_volume(nrrd(tmp_path / "a.nrrd", ball()[0], AFFINE, **changed), 1)
+
+
+def test_mixtures_and_probabilities_are_no_labels(tmp_path):
+    inside = ball()[0].astype(np.float32)
+    for rest in (0.5, 0.002, np.nan):
+        inside[3, 3, 3] = 1 + rest
+        with pytest.raises(ValueError, match="integers expected, found"):
+            read_volume(write(tmp_path / "a.nii", inside), 1)
+
+
 def test_damaged_volumes_are_refused(tmp_path):
     path = write(tmp_path / "a.nii", ball()[0].astype(np.uint8))
     data = path.read_bytes()
@@ -150,7 +216,7 @@ def test_damaged_volumes_are_refused(tmp_path):
         (data[:500], "bytes of voxels"),
         (huge, "27000000000000 bytes of voxels"),
         (flat, "an invertible affine map"),
-        (b"OFF 3 1 0" * 100, "NIfTI or MGH expected"),
+        (b"OFF 3 1 0" * 100, "NIfTI, MGH or NRRD expected"),
         (gzip.compress(data)[:-200], "truncated|damaged|bytes of voxels"),
     ):
         path.write_bytes(bytes(damaged))
@@ -182,7 +248,9 @@ def test_options_keep_their_labels_in_the_report():
 
 def test_a_volume_without_a_label_says_how_to_read_it(tmp_path):
     path = write(tmp_path / "a.nii.gz", ball()[0].astype(np.uint8))
-    with pytest.raises(ValueError, match=r"found a volume; give a label \(label=17, --label 17\)"):
+    with pytest.raises(
+        ValueError, match=r"found a volume \(NIfTI\); give a label \(label=17, --label 17\)"
+    ):
         s4a.read_mesh(path)
 
 
@@ -208,7 +276,9 @@ def test_of_a_folder_the_volumes_are_read_or_the_meshes(volumes):
     assert "notes.txt is not a label volume (a .txt file)" in by_glob["report"].attrs["remarks"]
     with pytest.raises(ValueError, match="no label volume of 5 files matching 'nothing'"):
         s4a.read_labels(volumes, label=17, pattern="nothing")
-    with pytest.raises(ValueError, match=r"no label volume \(.nii, .mgz, .mgh\).*a .ply file"):
+    with pytest.raises(
+        ValueError, match=r"no label volume \(.nii, .mgz, .mgh, .nrrd\).*a .ply file"
+    ):
         s4a.read_labels(str(volumes / "*.ply"), label=17)
     with pytest.raises(ValueError, match="label 4 expected, found 17"):
         s4a.read_labels(volumes, label=4)
@@ -234,7 +304,8 @@ def test_one_command_leads_from_volumes_to_modes_and_resumes_and_inserts(volumes
     study.close()
     s4a.write_mesh(tmp_path / "a mesh.ply", *mesh)  # meshes go into a study of volumes, too
     into = [str(out), str(tmp_path / "a mesh.ply"), "--out", str(tmp_path / "new")]
-    assert cli.main(["insert", *into]) == 0
+    assert cli.main(["insert", *into]) == 2  # a PLY file does not say its coordinate system
+    assert cli.main(["insert", *into, "--coordinate-system", "RAS", "--unit", "mm"]) == 0
     Y, S = mesh
     half = S[Y[S][:, :, 0].min(1) > Y[:, 0].mean() - 4]
     s4a.write_mesh(tmp_path / "half.ply", Y, half)

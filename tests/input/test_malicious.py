@@ -2,18 +2,26 @@
 
 import base64
 import gzip
+import importlib
+import inspect
 import io
 import itertools
 import json
 import os
+import pkgutil
+import re
+import signal
 import tracemalloc
 import zipfile
 import zlib
 
 import fuzz
+import h5py
 import numpy as np
 import pytest
 
+import s4a
+from s4a import synthetic
 from s4a.input.annotations import read_labels, read_landmarks, write_landmarks
 from s4a.input.files import WRITERS, find_meshes, read_mesh, stem_of, write_mesh
 
@@ -314,3 +322,124 @@ def test_what_unpacks_to_too_much_is_refused_before_it_fills_the_memory(tmp_path
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert most < 2**27
+
+
+# every public function that reads files
+
+FILLED = {"names": ["a"], "name": "a", "label": 1, "what": "mesh", "path": "a.ply"}
+# functions of this kind that write, or that keep a file or a folder open
+NOT_READERS = re.compile("(write|remove|lock|note|at_work|analyse|register|insert|map_|folder_of)")
+
+
+def readers():
+    """Public functions of both packages that require a path, and what fills other parameters."""
+    import s4a_morphometrics
+
+    mesh = synthetic.sphere(50)
+    filled = FILLED | {"mesh": mesh, "source": mesh, "target": mesh, "study": None}
+    filled["sources"] = {"a": ("a.ply", "")}
+    filled |= {"options": s4a.options.Options(), "key": "", "landmarks": None, "reference": "a"}
+    filled |= {"claim": None, "intersections": False, "references": ["a"], "template": "a"}
+    for package in (s4a, s4a_morphometrics):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if module.name.endswith(("__main__", "doctor")):
+                continue
+            for name, function in vars(importlib.import_module(module.name)).items():
+                is_own = getattr(function, "__module__", "") == module.name
+                if name.startswith("_") or not inspect.isfunction(function) or not is_own:
+                    continue
+                parameters = inspect.signature(function).parameters.values()
+                paths = [p.name for p in parameters if "Path" in str(p.annotation)]
+                needed = [p.name for p in parameters if p.default is p.empty and p.kind < 2]
+                if not paths or NOT_READERS.match(name) or {*needed} - {*filled, *paths}:
+                    continue
+                for path in paths:
+                    rest = {key: filled[key] for key in needed if key != path and key in filled}
+                    if {*needed} <= {*rest, path}:
+                        yield function, path, rest
+
+
+def hdf5_files(folder):
+    """HDF5 files of a few kB that reach other files, or need much memory."""
+    secret, other = folder / "secret", folder / "other.h5"
+    secret.write_bytes(b"the diary of somebody else " * 1000)
+    with h5py.File(other, "w") as file:
+        file["model/mean"] = file["s4a/contents_3"] = file["position"] = np.arange(9.0)
+    layout = h5py.VirtualLayout(shape=(9,), dtype="f8")
+    layout[:] = h5py.VirtualSource(str(other), "position", shape=(9,))
+    zeros = np.zeros(2**24)
+
+    def external(file, name):
+        file.create_dataset(name, (27_000,), "u1", external=[(str(secret), 0, 27_000)])
+
+    def packed(file, name):
+        if "zeros" not in file:
+            file.create_dataset("zeros", data=zeros, compression="gzip", chunks=(2**20,))
+        file[name] = file["zeros"]
+
+    kinds = {
+        "storage": external,
+        "link": lambda file, name: file.__setitem__(name, h5py.ExternalLink(str(other), name)),
+        "virtual": lambda file, name: file.create_virtual_dataset(name, layout),
+        "unwritten": lambda file, name: file.create_dataset(name, (2**30,), "f8", chunks=(2**20,)),
+        "zeros": packed,
+    }
+    for kind, make in kinds.items():
+        path = folder / f"{kind}.nc"
+        with h5py.File(path, "w") as file:
+            for name in ("model/mean", "s4a/contents_3", "position"):
+                make(file, name)
+        yield path
+    with h5py.File(folder / "groups.nc", "w") as file:
+        file["s4a"] = file["model"] = h5py.ExternalLink(str(other), "/model")
+    yield folder / "groups.nc"
+
+
+def special_files(folder):
+    """A pipe, and links that lead to themselves or to a device without end."""
+    os.mkfifo(folder / "pipe.nc")
+    (folder / "loop.nc").symlink_to(folder / "loop.nc")
+    (folder / "device.nc").symlink_to("/dev/zero")
+    return [folder / f"{name}.nc" for name in ("pipe", "loop", "device")]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes")
+def test_no_public_function_reads_beyond_a_hostile_file(tmp_path):
+    def stop(*_):
+        raise RuntimeError("it waits")
+
+    found = list(readers())
+    names = {function.__name__ for function, _, _ in found}
+    known = "read_mesh read_shape read_shapes read_landmarks read_labels read_scalars read_volume "
+    known += "read_table open_study open_inserted verify status read_scalismo open_structures"
+    assert names >= {*known.split(), "match_pair"}
+    folder = tmp_path / "study"
+    (folder / "original").mkdir(parents=True)
+    within = [folder / name for name in ("original/a.nc", "report.nc", "inserted.nc")]
+    before = signal.signal(signal.SIGALRM, stop)
+    tracemalloc.start()
+    try:
+        for hostile in [*hdf5_files(tmp_path), *special_files(tmp_path)]:
+            for path in within:
+                path.unlink(missing_ok=True)
+                os.link(hostile, path, follow_symlinks=False)
+            for function, name, rest in found:
+                for target in (hostile, folder):
+                    what = f"{function.__module__}.{function.__name__}({name}={target})"
+                    signal.alarm(5)
+                    tracemalloc.reset_peak()
+                    try:
+                        result = function(**{name: target}, **rest)
+                        if hasattr(result, "__enter__") and hasattr(result, "gen"):
+                            with result:
+                                pass
+                        result = repr(result)
+                    except (ValueError, OSError, TypeError, AttributeError) as error:
+                        result = str(error)
+                    finally:
+                        signal.alarm(0)
+                    assert "diary" not in result, what
+                    assert tracemalloc.get_traced_memory()[1] < 2**27, what
+    finally:
+        tracemalloc.stop()
+        signal.signal(signal.SIGALRM, before)

@@ -8,6 +8,7 @@ import pytest
 from paths import DATA
 
 from s4a.input.files import find_meshes, not_meshes, read_mesh, slug, write_mesh
+from s4a.input.polygons import triangulated
 
 X = np.array([[0, 0, 0], [1.5, 0, 0], [1.5, 2, 0], [0, 2, 0], [0.25, 0.5, 3]])
 T = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
@@ -135,7 +136,7 @@ def test_vtk_is_read_as_text_with_quads_and_metadata(tmp_path):
     attrs = same_surface(
         file(tmp_path, "m.vtk", text), X, np.vstack([[[0, 3, 2], [0, 2, 1]], T[2:]])
     )
-    assert attrs == {"format": "VTK", "coordinate_system": "RAS"}
+    assert attrs == {"format": "VTK", "coordinate_system": "RAS", "unit": "mm"}
 
 
 def test_binary_vtk_5_is_read_with_offsets(tmp_path):
@@ -143,6 +144,111 @@ def test_binary_vtk_5_is_read_with_offsets(tmp_path):
     data = head.encode() + X.astype(">f8").tobytes() + b"\nPOLYGONS 7 18\nOFFSETS vtktypeint64\n"
     data += (np.arange(7) * 3).astype(">i8").tobytes() + b"\nCONNECTIVITY vtktypeint64\n"
     same_surface(file(tmp_path, "m.vtk", data + T.astype(">i8").tobytes() + b"\n"))
+
+
+# a prism over a letter: concave at (20, 20), with a corner on a straight side, of area 8,800
+OUTLINE = np.array([[0, 0], [60, 0], [60, 20], [20, 20], [20, 60], [0, 60], [0, 30.0]])
+
+
+def prism(roll, lift=0.0):
+    """Vertices and polygons of a prism, whose first corners are chosen by `roll`."""
+    n = len(OUTLINE)
+    points = np.r_[np.c_[OUTLINE, np.zeros(n)], np.c_[OUTLINE, np.full(n, 20.0)]]
+    points[4, 2] -= lift  # then five polygons are not planar
+    sides = [[i, (i + 1) % n, n + (i + 1) % n, n + i] for i in range(n)]
+    faces = [list(range(n))[::-1], list(range(n, 2 * n)), *sides]
+    return points, [[*face[roll % len(face) :], *face[: roll % len(face)]] for face in faces]
+
+
+def polygon_files(points, faces):
+    """The prism in every format with polygons."""
+    rows = "\n".join("{} {} {}".format(*x) for x in points)
+    counted = "\n".join(f"{len(f)} {' '.join(map(str, f))}" for f in faces)
+    n, size = len(points), sum(map(len, faces))
+    flat = " ".join(str(i) for f in faces for i in f)
+    ends = " ".join(map(str, np.cumsum([len(f) for f in faces])))
+    obj = "v " + rows.replace("\n", "\nv ") + "\n"
+    yield "a.obj", obj + "".join(f"f {' '.join(str(i + 1) for i in f)}\n" for f in faces)
+    yield "a.off", f"OFF\n{n} {len(faces)} 0\n{rows}\n{counted}\n"
+    head = f"ply\nformat ascii 1.0\nelement vertex {n}\nproperty double x\nproperty double y\n"
+    head += f"property double z\nelement face {len(faces)}\n"
+    yield "a.ply", f"{head}property list uchar int vertex_indices\nend_header\n{rows}\n{counted}"
+    head = VTK_HEAD.format("3.0", "ASCII") + f"POINTS {n} double\n{rows}\nPOLYGONS {len(faces)} "
+    yield "a.vtk", f"{head}{size + len(faces)}\n{counted}\n"
+    array = '<DataArray type="{}" Name="{}" format="ascii">{}</DataArray>'.format
+    polys = array("Int64", "connectivity", flat) + array("Int64", "offsets", ends)
+    yield (
+        "a.vtp",
+        f'<VTKFile type="PolyData"><PolyData><Piece NumberOfPoints="{n}" NumberOfPolys='
+        f'"{len(faces)}"><Points>{array("Float64", "Points", rows)}</Points><Polys>{polys}'
+        "</Polys></Piece></PolyData></VTKFile>",
+    )
+
+
+def area_and_volume(points, triangles):
+    a, b, c = points[triangles].transpose(1, 0, 2)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, (a * np.cross(b, c)).sum() / 6
+
+
+def test_area_and_volume_do_not_depend_on_the_first_corner_of_a_polygon(tmp_path):
+    for lift, expected in ((0.0, (8800, 40_000)), (5.0, None)):
+        for roll in range(7):
+            for name, content in polygon_files(*prism(roll, lift)):
+                points, triangles, attrs = read_mesh(file(tmp_path, name, content))
+                found = area_and_volume(points, triangles)
+                expected = expected or found
+                np.testing.assert_allclose(found, expected, rtol=1e-12, err_msg=f"{name} {roll}")
+                assert len(triangles) == 24
+                assert "note" not in attrs
+
+
+def test_any_simple_polygon_is_covered_once():
+    rng = np.random.default_rng(0)
+    angle, radius = np.linspace(6, 20, 20), np.array([[0.0], [1.5]])
+    arms = np.stack([(angle + radius) * np.cos(angle), (angle + radius) * np.sin(angle)], axis=2)
+    tenths = np.arange(20) * np.pi / 10
+    hole = [[0, 0], [1, 1], [1, 3], [3, 3], [3, 1], [1, 1]]
+    outlines = {
+        "spiral": np.r_[arms[0], arms[1][::-1]],
+        "star": np.tile([3, 0.6], 10)[:, None] * np.c_[np.cos(tenths), np.sin(tenths)],
+        "cut to a hole": [[0, 0], [4, 0], [4, 4], [0, 4], *hole],
+        "repeated corner": [[0, 0], [1, 0], [2, 0], [2, 0], [2, 2], [1, 0.5], [0, 2]],
+        "no area": [[0, 0], [1, 0], [2, 0], [3, 0], [3, 0]],
+    }
+    for name, outline in outlines.items():
+        x, y = np.array(outline, float).T
+        expected = (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        points = np.c_[x, y, 0 * x] @ turn + 5
+        n = len(x)
+        for roll in range(0, n, 3):
+            T, n_crossing = triangulated(points, np.roll(np.arange(n), roll), np.array([n]))
+            assert area_and_volume(points, T)[0] == pytest.approx(abs(expected), abs=1e-9), name
+            assert (len(T), n_crossing) == (n - 2, 0)
+
+
+def test_a_polygon_that_intersects_itself_is_reported(tmp_path):
+    text = "OFF\n4 1 0\n0 0 0\n2 2 0\n2 0 0\n0 1 0\n4 0 1 2 3\n"
+    assert "1 polygons intersect themselves" in read_mesh(file(tmp_path, "a.off", text))[2]["note"]
+
+
+def test_triangle_strips_are_read(tmp_path):
+    rows = "\n".join("{} {} {}".format(*x) for x in X)
+    expected = [[0, 1, 2], [3, 2, 1], [2, 3, 4], [0, 4, 1]]
+    head = "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\n"
+    head += "property float z\nelement tristrips 1\nproperty list int int vertex_indices\n"
+    vtk = f"{VTK_HEAD.format('3.0', 'ASCII')}POINTS 5 float\n{rows}\nTRIANGLE_STRIPS 2 10\n"
+    array = '<DataArray type="{}" Name="{}" format="ascii">{}</DataArray>'.format
+    cells = array("Int64", "connectivity", "0 1 2 3 4 0 4 1") + array("Int64", "offsets", "5 8")
+    vtp = '<VTKFile type="PolyData"><PolyData><Piece NumberOfPoints="5" NumberOfStrips="2">'
+    vtp += f"<Points>{array('Float64', 'Points', rows)}</Points><Strips>{cells}</Strips></Piece>"
+    files = {
+        "a.ply": f"{head}end_header\n{rows}\n9 0 1 2 3 4 -1 0 4 1\n",
+        "a.vtk": f"{vtk}5 0 1 2 3 4\n3 0 4 1\n",
+        "a.vtp": f"{vtp}</PolyData></VTKFile>",
+    }
+    for name, content in files.items():
+        same_surface(file(tmp_path, name, content), X, np.array(expected))
 
 
 SEEDS = fuzz.seeds()
@@ -160,8 +266,11 @@ def test_every_encoding_of_a_format_gives_the_same_surface(tmp_path, name):
     for content in wholes(name):
         result, corners, attrs = read_mesh(file(tmp_path, f"m{SEEDS[name][0]}", content))
         np.testing.assert_allclose(result[corners], points[triangles], atol=1e-6)
-        brain = {"coordinate_system": "RAS", "unit": "mm"}
-        assert attrs == {"format": name} | (brain if name in ("GIFTI", "FreeSurfer") else {})
+        system = {"GIFTI": "RAS, origin unknown", "FreeSurfer": "surface RAS", "MNI": "RAS"}.get(
+            name
+        )
+        known = {"coordinate_system": system, "unit": "mm"} if system else {}
+        assert attrs == {"format": name} | known
 
 
 @pytest.mark.parametrize(
@@ -186,13 +295,15 @@ def test_a_file_cut_anywhere_is_refused_with_its_name(tmp_path):
 
 
 def test_counts_beyond_the_file_are_named(tmp_path):
+    write_mesh(tmp_path / "m.stl", X, T)
+    stl = (tmp_path / "m.stl").read_bytes()
     promise = {
         "a.ply": ply("binary_little_endian").replace(
             b"element vertex 5", b"element vertex 4000000000"
         ),
         "b.ply": ply("ascii").replace(b"element face 6", b"element face 4000000000"),
         "c.off": b"OFF\n5 4000000000 0\n0 0 0\n",
-        "d.stl": b"x".ljust(80) + struct.pack("<I", 4_000_000_000) + bytes(500),
+        "d.stl": b"x".ljust(80) + struct.pack("<I", 4_000_000_000) + stl[84:],
         "e.vtk": (VTK_HEAD.format("3.0", "ASCII") + "POINTS 4000000000 float\n0 0 0\n").encode(),
     }
     for name, content in promise.items():
@@ -221,6 +332,78 @@ def test_a_ply_says_what_its_header_lacks(tmp_path, before, after, words):
     (tmp_path / "m.ply").write_text(head.replace(before, after) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     with pytest.raises(ValueError, match=f"m.ply cannot be read as PLY: .*{words}"):
         read_mesh(tmp_path / "m.ply")
+
+
+def test_a_second_ply_in_a_file_is_named(tmp_path):
+    for order in ("ascii", "binary_little_endian"):
+        with pytest.raises(ValueError, match=r"one mesh expected, found a second PLY at byte \d+"):
+            read_mesh(file(tmp_path, "m.ply", 2 * ply(order)))
+
+
+def test_text_in_utf_16_is_named(tmp_path):
+    text = "".join(f"v {x} {y} {z}\n" for x, y, z in X) + "f 1 2 3\n"
+    for encoding in ("utf-16", "utf-16-le", "utf-16-be"):
+        with pytest.raises(ValueError, match="text in UTF-16 found: save it as UTF-8"):
+            read_mesh(file(tmp_path, "m.obj", text.encode(encoding)))
+
+
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        (b"\x89HDF\r\n\x1a\n", "an HDF5 file"),
+        (b"MATLAB 5.0 MAT-file, Platform", "a MATLAB file"),
+        (b"glTF\2\0\0\0", "a glTF file"),
+        (b'{"scenes": [], "asset": {"version": "2.0"}}', "a glTF file"),
+        (b"NRRD0004\ntype: uchar\n", r"found a volume \(NRRD\); give a label"),
+        (bytes(128) + b"DICM", "a DICOM file"),
+        (b"\x89PNG\r\n\x1a\n", "a picture"),
+        (b"BZh91AY", "a compressed file"),
+        (b"MZ\x08\0" + struct.pack("<III", 0, 100, 0), "found an overlay of values or colours"),
+    ],
+)
+def test_files_of_other_kinds_are_named(tmp_path, content, words):
+    for body in (b"", bytes(400), np.arange(5000, dtype="<i4").tobytes()):
+        with pytest.raises(ValueError, match=rf"m\.stl.*{words}"):
+            read_mesh(file(tmp_path, "m.stl", content + body))
+
+
+def test_no_other_binary_file_is_read_as_stl(tmp_path):
+    rng = np.random.default_rng(0)
+    kinds = [
+        lambda n: rng.integers(0, 256, n).astype("u1"),
+        lambda n: rng.integers(0, 100, n).astype("<i4"),
+        lambda n: rng.normal(size=n).astype("<f4"),
+        lambda n: rng.normal(size=n),
+        lambda n: np.zeros(n, "u1"),
+        lambda n: np.r_[np.zeros(20, "<i4"), 5, rng.integers(-500, 500, n)].astype("<i4"),
+    ]
+    for i in range(120):
+        content = kinds[i % len(kinds)](int(rng.integers(1, 4000))).tobytes()
+        with pytest.raises(ValueError, match="unknown format"):
+            read_mesh(file(tmp_path, "m.stl", content))
+
+
+@pytest.mark.parametrize(
+    "name", ["L4", "L4 facet left", "facet L4", "L4 vertex 1 2 3", "L4 endsolid", "endfacet", ""]
+)
+def test_the_name_of_an_stl_solid_is_free_text(tmp_path, name):
+    facets = "".join(
+        " facet normal 0 0 0\n  outer loop\n"
+        + "".join("   vertex {} {} {}\n".format(*x) for x in X[t])
+        + "  endloop\n endfacet\n"
+        for t in T
+    )
+    for end in ("\n", "\r\n"):
+        text = f"solid {name}\n{facets}endsolid {name}\n".replace("\n", end)
+        same_surface(file(tmp_path, "m.stl", text))
+
+
+def test_an_stl_file_with_a_second_one_behind_is_refused(tmp_path):
+    write_mesh(tmp_path / "m.stl", X, T)
+    data = (tmp_path / "m.stl").read_bytes()
+    same_surface(file(tmp_path, "m.stl", data + b"made by hand"))
+    with pytest.raises(ValueError, match=r"6 triangles of 384 bytes expected, found 768 bytes"):
+        read_mesh(file(tmp_path, "m.stl", data + data))
 
 
 def test_indices_beyond_the_vertices_are_named(tmp_path):

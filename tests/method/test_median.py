@@ -78,18 +78,20 @@ def test_the_median_is_the_nearest_and_a_stretched_shape_the_farthest():
 
 def test_the_scores_of_differences_are_centred_and_keep_their_distances():
     D = np.random.default_rng(0).normal(size=(6, 4, 4))
-    score, ratio = median.difference_pca(D)
+    score, ratio, component = median.difference_pca(D)
     assert score.shape == (6, 5)
     assert score.mean(0) == pytest.approx(np.zeros(5), abs=1e-12)
     assert np.linalg.norm(score[0] - score[1]) == pytest.approx(np.linalg.norm(D[0] - D[1]))
+    assert np.einsum("nc,cij->nij", score, component) == pytest.approx(D - D.mean(0), abs=1e-5)
+    assert np.linalg.norm(component, axis=(1, 2)) == pytest.approx(np.ones(5))
     assert ratio.sum() == pytest.approx(1)
     assert (np.diff(ratio) < 0).all()
     assert ((score**3).sum(0) >= 0).all()
 
 
 def test_equal_differences_have_no_variance():
-    score, ratio = median.difference_pca(np.stack([np.eye(3)] * 4))
-    assert np.abs(score).max() == 0
+    score, ratio, component = median.difference_pca(np.stack([np.eye(3)] * 4))
+    assert np.abs(score).max() == np.abs(component).max() == 0
     assert ratio.tolist() == [0, 0, 0]
 
 

@@ -54,6 +54,7 @@ def projection(study, name):
     np.add.at(
         U, (np.arange(len(U))[:, None], column), study["coarse"][name]["coarse_weight"].values
     )
+    assert np.array_equal(U, s4a.projection_operator(study["coarse"][name]).toarray())
     return U
 
 
@@ -88,6 +89,20 @@ def test_the_landmarks_are_ten_and_their_partners_the_nearest_after_icp(paper):
         assert are_nearest(network["landmark_of_target"].values[p], moved, N)
 
 
+def test_the_stored_descriptors_and_map_have_the_stored_energies(paper):
+    network = paper["network"].to_dataset()
+    values = (network[name].values for name in ("fmap_fitted", "descriptor_of_source"))
+    C, F = values
+    residual = C @ F - network["descriptor_of_target"].values
+    assert network["descriptor_energy"].values == pytest.approx((residual**2).sum((1, 2)), rel=1e-4)
+    spectra = {n: c["eigenvalue"].values[:10] for n, c in paper["coarse"].children.items()}
+    for p, ends in enumerate(zip(network["source"].values, network["target"].values, strict=True)):
+        source, target = (spectra[name] for name in ends)
+        commute = ((target[:, None] - source) / max(source[-1], target[-1])) ** 2
+        energy = 1e-3 * (F[p] ** 2).sum() * (commute * C[p] ** 2).sum()
+        assert network["laplacian_energy"].values[p] == pytest.approx(energy, rel=1e-4)
+
+
 def test_the_initial_refinement_is_one_match_and_its_map(paper):
     network = paper["network"]
     for p, (i, j) in enumerate(
@@ -114,6 +129,12 @@ def test_every_iteration_of_consistent_zoomout_is_equation_3_and_a_larger_map(pa
             match = cdist(Psi[:, :size] @ Y_j, Phi[:, :size] @ Y_i).argmin(1)  # eq. 3
             C = Psi[:, :larger].T @ A @ Phi[match, :larger]
             assert following["fmap"].values[p] == pytest.approx(C, abs=1e-3)
+            ends = np.cumsum(now["matched_count"].values)[[p - 1, p]] * [p > 0, 1]
+            assert (now["matched_source"].values[slice(*ends)] == match).mean() > 0.999
+            assert (now["matched_target"].values[slice(*ends)] == np.arange(len(match))).all()
+    assert network["iteration_size"].values.tolist() == [10, 15, 20, 24]
+    assert np.array_equal(network["iteration_weight"][-1], network["weight"])
+    assert np.array_equal(network["iteration_cycle_error"][0], network["cycle_error_initial"])
     assert np.array_equal(iterations[-1]["fmap"], network["fmap"])
     assert np.array_equal(iterations[-1]["latent_basis"], paper["latent"]["latent_basis"])
 
@@ -144,6 +165,7 @@ def test_the_median_has_the_least_energy_of_equation_5(paper):
         D = Y.T @ Y
         energy.append(np.linalg.norm(((D - np.eye(len(D))) * inverse)[1:, 1:]))
     assert node["distance_to_limit"].values == pytest.approx(energy)
+    assert node["distance_by_norm"].sel(norm="h2").values == pytest.approx(energy)
     assert node.attrs["median"] == node["shape"].values[np.argmin(energy)]
 
 
@@ -224,8 +246,9 @@ def test_the_smooth_displacement_is_the_projection_as_printed(fixture, request):
         assert stored(study, "displacement", name) == pytest.approx(B @ coefficient, abs=1e-3)
 
 
-def test_consistent_zoomout_is_that_of_pyfm_where_weights_are_equal(paper):
-    """Same subspaces, same matches from the same maps; other weights of pyFM's are by cycles."""
+@pytest.mark.parametrize("isometric", [False, True])
+def test_consistent_zoomout_is_that_of_pyfm_where_weights_are_equal(paper, isometric):
+    """Same subspaces and matches from the same maps, in both readings (pyfmaps 1.3.1)."""
     names = paper["latent"]["shape"].values.tolist()
     bases = [Shape(coarse=paper["coarse"][name].to_dataset()).low for name in names]
     source, target = (
@@ -243,10 +266,10 @@ def test_consistent_zoomout_is_that_of_pyfm_where_weights_are_equal(paper):
     edges = list(zip(source.tolist(), target.tolist(), strict=True))
     other = FMN(meshes, dict(zip(edges, first, strict=True)))
     other.zoomout_refine(
-        nit=2, step=5, subsample=None, isometric=False, weight_type="adjacency", cclb_ratio=1.0
+        nit=2, step=5, subsample=None, isometric=isometric, weight_type="adjacency", cclb_ratio=1.0
     )
     C, _, _, Y, eigenvalue = latent.consistent_zoomout(
-        bases, first, source, target, 20, step=5, weights="equal"
+        bases, first, source, target, 20, step=5, weights="equal", isometric=isometric
     )
     assert np.stack([other.maps[edge] for edge in edges]) == pytest.approx(C, abs=1e-3)
 

@@ -20,7 +20,7 @@ GRAPH = {name: structure.imports_of(path) & {*MODULES} - {name} for name, path i
 # what the extension may use: docs/extensions.md names the modules, all without an underscore
 PUBLIC = re.compile(
     r"(schema|seeds|extensions|cli(\.(commands|flags|tables))?|(geometry|input|method|analysis|evaluation|show|widgets"
-    r"|datasets)(\.\w+)*|options|study\.(tree|insert|pair|pipeline|processes|store))(\.\w+)?"
+    r"|datasets)(\.\w+)*|options|study\.(tree|insert|netcdf|pair|pipeline|processes|store))(\.\w+)?"
 )
 
 
@@ -68,6 +68,32 @@ def test_one_module_imports_a_package_that_a_browser_lacks():
     pattern = rf"^\s*(?:import|from) ({'|'.join(PACKAGES)})\b"
     found = [name for name, path in MODULES.items() if re.search(pattern, text(path), re.MULTILINE)]
     assert found == []  # s4a.geometry.compiled gets them by name
+
+
+def calls_of_hdf5(text):
+    """Calls that open HDF5 or netCDF files, other than for writing, in Python code."""
+    names = {"File", "open_dataset", "load_dataset", "open_datatree", "open_dataarray",
+             "load_dataarray", "open_mfdataset", "load_datatree", "open_groups"}  # fmt: skip
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            call, arguments = ast.unparse(node.func), [ast.unparse(one) for one in node.args]
+            is_written = call == "h5py.File" and arguments[1:] == ["'w'"]
+            if (node.func.attr in names or call == "h5f.open") and not is_written:
+                yield call
+        if isinstance(node, ast.ImportFrom | ast.Import):
+            imported = [alias.name for alias in node.names]
+            yield from sorted(names & {*imported} | {"netCDF4", "h5netcdf"} & {*imported})
+
+
+def test_one_function_opens_hdf5_files():
+    found = {
+        f"{path.stem}: {call}"
+        for path in [*MODULES.values(), *structure.EXTENSION.rglob("*.py")]
+        for call in calls_of_hdf5(text(path))
+    }
+    assert found == {"netcdf: h5f.open", "netcdf: xr.open_dataset"}  # the second in `open_plain`
+    seen = "import h5py\nh5py.File(a)\nh5py.File(a, 'w')\nxr.load_dataset(a)\nimport netCDF4"
+    assert sorted(calls_of_hdf5(seen)) == ["h5py.File", "netCDF4", "xr.load_dataset"]
 
 
 PANELS = ("ipywidgets", "pythreejs", "anywidget")

@@ -12,7 +12,7 @@ from small import FLAGS, OPTIONS
 import s4a
 from s4a.analysis import transfer
 from s4a.cli import main
-from s4a.options import PRESETS, Options, with_options
+from s4a.options import DECLARED, PRESETS, Options, with_options
 
 PAPER, FAST = PRESETS["paper"], PRESETS["fast"]
 DEFAULTS = {name: PRESETS[None][name] for name in PAPER}
@@ -66,7 +66,7 @@ def test_an_option_that_the_preset_fixes_is_refused_by_name(meshes):
         given = {"preset": "paper", name: DEFAULTS[name]}
         with pytest.raises(ValueError, match=message):
             Options(**given)
-        if name not in ("n_samples", "dense_iterations"):  # which are of a network
+        if DECLARED[name].metadata["pair"]:
             with pytest.raises(ValueError, match=message):
                 s4a.match_pair(source, target, **given)
             with pytest.raises(ValueError, match=message):

@@ -1,0 +1,270 @@
+"""Check of the columns of a table (6.1): codes of missing values, outliers, names that look alike.
+
+Values are reported and never changed.  A test is refused where it would be meaningless.
+"""
+
+import logging
+import re
+import unicodedata
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import stdtr
+
+from s4a.input.files import visible
+from s4a.input.subjects import is_plain_number, listed
+
+log = logging.getLogger(__name__)
+
+# -9, 99, -999, 9998 and alike, and the largest integers of 16 and 32 bits
+_CODES = {-1.0, *(float(s + n + d) for s in ("", "-") for d in "789" for n in ("", "9", "99"))}
+_CODES |= {float(s + d * n) for s in ("", "-") for d in "789" for n in range(2, 7)}
+_CODES |= {float(s + n) for s in ("", "-") for n in ("9998", "9997", "32768", "2147483648")}
+_CODES |= {32767.0, 65535.0, 2147483647.0}
+_WORDS = re.compile(r"[?.]+|unknown|missing|not available|n\.a\.|n\.?d\.?|#.*[!?]", re.IGNORECASE)
+# level of an outlier in a column; of a usual code; of a value ten times the others
+_LEVEL, _CODE_LEVEL, _SLIP_LEVEL = 3e-4, 0.01, 0.04
+_POWERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the Box-Cox transformation
+# Cyrillic and Greek letters and dashes that look like Latin letters and the hyphen
+_SAME = str.maketrans(
+    "аеорсухіѕјкмнтвΑΒΕΖΗΙΚΜΝΟΡΤΥΧαοινρυχ‐‑‒–—−", "aeopcyxisjkmhtbABEZHIKMNOPTYXaoivpux------"
+)
+
+
+def check_column(
+    values: np.ndarray, names: Sequence[str], what: str, *, categories: bool = False
+) -> None:
+    """Check a column before a test: codes of missing values, outliers, names that look alike.
+
+    Parameters
+    ----------
+    values : ndarray (s,) or (s, c)
+        Numbers, which may be NaN, or text.
+    names : sequence of str (s,)
+        Names of the shapes.
+    what : str
+        Name of the column in messages.
+    categories : bool
+        Whether numbers are names of groups or subjects.
+
+    Raises
+    ------
+    ValueError
+        If a value is certainly a code of a missing value, or two names differ only in characters
+        that cannot be seen.  Other findings are warnings.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.input.columns import check_column
+    >>> check_column(np.array([31, 40, -999, 52]), ["a", "b", "c", "d"], "age")
+    Traceback (most recent call last):
+    ValueError: age: -999 of c is a code of a missing value (others 31 to 52): write NA, or, if it \
+is a value, give the column in another unit
+    """
+    for column in np.reshape(values, (len(values), -1)).T:
+        is_text = column.dtype.kind == "U" and not all(map(is_plain_number, column))
+        if categories or is_text:
+            _check_names(list(map(str, column.tolist())), names, what)
+        else:
+            _check_numbers(column.astype(float), names, what)
+
+
+def _check_names(cells, names, what):
+    """Check names of groups or subjects."""
+    numbers = np.array([float(c) if is_plain_number(c) else np.nan for c in cells])
+    is_mixed = np.isnan(numbers).any()
+    codes = np.isin(numbers, list(_CODES)) if is_mixed else missing_codes(numbers)
+    codes |= [bool(_WORDS.fullmatch(cell)) for cell in cells]
+    _report_codes(codes, cells, names, what, "the others are names" if is_mixed else "")
+    for same, variants in look_alikes(cells):
+        example = {cell: names[cells.index(cell)] for cell in variants}
+        text = f"{what}: {' and '.join(f'{cell!a} ({name})' for cell, name in example.items())} "
+        if same:
+            raise ValueError(
+                f"{text}look alike, and differ only in how their characters are stored, or in ones "
+                "that cannot be seen: write the same name for the same group"
+            )
+        log.warning("%sdiffer only in case or form: are these different groups?", text)
+
+
+def _check_numbers(x, names, what):
+    """Check a column of numbers."""
+    known = np.isfinite(x)
+    codes = known.copy()
+    codes[known] = missing_codes(x[known])
+    rest = known & ~codes
+    cells = [f"{value:.10g}" for value in x]
+    others = f"others {min(x[rest]):.10g} to {max(x[rest]):.10g}" if rest.any() else ""
+    _report_codes(codes, cells, names, what, others)
+    far = rest.copy()
+    far[rest] = outlying(x[rest])
+    if far.any():
+        rest = x[rest & ~far]
+        log.warning(
+            "%s: outliers, %s (others %.10g to %.10g): correct the value, or write NA, if it is "
+            "wrong; the test uses it",
+            what,
+            listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(far)]),
+            rest.min(),
+            rest.max(),
+        )
+
+
+def _report_codes(codes, cells, names, what, others):
+    """Warn about codes of missing values, or ValueError if one is certain."""
+    found = listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(codes)])
+    if not found:
+        return
+    numbers = [float(cells[i]) for i in np.flatnonzero(codes) if is_plain_number(cells[i])]
+    others = f" ({others})" if others else ""
+    if any(x < -10 or x > 99 for x in numbers):  # others may be values
+        raise ValueError(
+            f"{what}: {found} is a code of a missing value{others}: write NA, or, if it is a "
+            "value, give the column in another unit"
+        )
+    log.warning("%s: %s may be a code of a missing value%s: write NA if so", what, found, others)
+
+
+def missing_codes(x: np.ndarray) -> np.ndarray:
+    """Return a mask of numbers ``(n,)`` that are a usual code of missing values, and stand apart.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.input.columns import missing_codes
+    >>> missing_codes(np.array([31, 40, -9, 52.0])).tolist()
+    [False, False, True, False]
+    >>> missing_codes(np.array([-9, -4, 7, 12.0])).any()
+    np.False_
+    """
+    possible = np.isin(x, list(_CODES))
+    found = np.zeros(len(x), bool)
+    for code in np.unique(x[possible]):
+        # of one digit, values may be codes of the other sign, or -1
+        digit = (abs(x) < 10) & ((x * code < 0) | (x == -1)) & (x != code)
+        rest = x[~possible | digit]
+        if len(np.unique(rest)) > 1:
+            found |= (x == code) & _is_code(code, rest, (x == code).sum())
+    return found
+
+
+def _is_code(code, rest, count):
+    """Whether a usual code is one among the other values of its column."""
+    n, decimals, extent = len(rest) + 1, (rest % 1 != 0).mean(), np.ptp(rest)
+    level, levels = n * _p_value(code, rest), len(np.unique(rest))
+    if 2 * levels < n and rest.min() >= 0 and abs(code) > 2 * rest.max():
+        return True  # one of few levels
+    if code < 0 <= rest.min():
+        zero_is_far = rest.min() >= max(5, abs(code)) or level < _CODE_LEVEL
+        return code < -10 or zero_is_far or (n > 4 and code < -1 and decimals > 0.75)
+    if abs(code) > 99 and n > 5 and decimals == 1:
+        return True  # the only integer
+    if 0 < code < 10 and rest.min() < 0:
+        return False
+    if code > 5 * rest.max() > 0 and code > 8:
+        return True
+    gap = rest.min() - code if code < 0 else code - rest.max()
+    if count > 1 and gap > max(np.diff(np.unique(rest)).max(), extent / 4, 3):
+        return True
+    return gap > max(extent, 3) and level < _CODE_LEVEL
+
+
+def outlying(x: np.ndarray) -> np.ndarray:
+    """Return a mask of outliers of numbers ``(n,)``, in a column of any skewness.
+
+    The others are brought to a normal distribution by a power (Box and Cox 1964), and a value is
+    compared with them by the t distribution of a new observation.  A value that is 10, 100 or 1000
+    times one in their range, as 290 for 29, needs less evidence.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.input.columns import outlying
+    >>> outlying(np.array([25, 31, 29, 40, 290.0])).tolist()
+    [False, False, False, False, True]
+    >>> outlying(np.exp([0.1, 1.2, 0.4, 2.1, 3.0])).any()
+    np.False_
+    """
+    found = np.zeros(len(x), bool)
+    if len(x) < 5:
+        return found
+    for sign in (1, -1):
+        # values of one end, up to a tenth of the column, or a third if they are equal
+        for value in np.unique(sign * x)[: -min(len(x) // 10, 5) - 2 : -1]:
+            end = sign * x >= value
+            most = len(x) / (3 if np.ptp(x[end]) == 0 else 10)
+            if end.sum() <= max(most, 1) and _is_outlying(sign * value, x[~end], len(x)):
+                found |= end
+    return found
+
+
+def _is_outlying(value, rest, n):
+    low, high = np.quantile(rest, [0.1, 0.9])
+    slips = value / 10.0 ** np.array([-3, -2, -1, 1, 2, 3])
+    is_slip = 0 < high < 4 * low and ((slips >= low) & (slips <= high)).any()
+    return _p_value(value, rest) * n < (_SLIP_LEVEL if is_slip else _LEVEL)
+
+
+def _p_value(value, rest):
+    """Return the p value of a new observation among others ``(m,)``, after a transformation."""
+    step = np.diff(np.unique(rest)).min(initial=np.inf)
+    if not np.isfinite(step):  # a constant
+        return 1.0
+    scale = np.abs(rest).max()
+    value, rest, step = value / scale, rest / scale, step / scale
+    power, shift = 1.0, 0.0
+    if min(value, rest.min()) >= 0:
+        # zero has no logarithm
+        shift = rest[rest > 0].min() if min(value, rest.min()) == 0 else 0.0
+        every = np.append(rest, value) + shift
+        power = max(_POWERS, key=lambda power: _likelihood(every, power))
+    y = _transformed(rest + shift, power)
+    # numbers are rounded to steps
+    middle = np.median(rest) + shift
+    rounding = np.diff(_transformed(np.array([middle, middle + step]), power))[0]
+    deviation = np.hypot(y.std(ddof=1), rounding) * np.sqrt(1 + 1 / len(y))
+    t = (_transformed(np.array([value + shift]), power)[0] - y.mean()) / deviation
+    return 2 * stdtr(len(y) - 1, -abs(t))
+
+
+def _transformed(x, power):
+    return np.log(x) if power == 0 else x**power / power
+
+
+def _likelihood(x, power):
+    """Return the logarithm of the likelihood of a power (Box and Cox 1964)."""
+    return (power - 1) * np.log(x).sum() - len(x) / 2 * np.log(_transformed(x, power).var())
+
+
+def look_alikes(cells: Sequence[str]) -> list[tuple[bool, list[str]]]:
+    """Return different texts that look alike, and whether they cannot be told apart by eye.
+
+    Examples
+    --------
+    >>> from s4a.input.columns import look_alikes
+    >>> look_alikes(["a", "A", "b", "b\\u200b"])
+    [(False, ['A', 'a']), (True, ['b', 'b\\u200b'])]
+    """
+    found = []
+    by_look: dict[str, list[str]] = {}
+    for cell in sorted({*cells}):
+        by_look.setdefault(look(cell), []).append(cell)
+    for variants in by_look.values():
+        if len(variants) > 1:
+            found.append((len({*map(visible, variants)}) < len(variants), variants))
+    return found
+
+
+def look(text: str) -> str:
+    """Return what texts that look alike have in common: compatible letters in lower case.
+
+    Examples
+    --------
+    >>> from s4a.input.columns import look
+    >>> look(" Site\\u00a01 ") == look("site 1"), look("01") == look("1.0")
+    (True, True)
+    """
+    text = unicodedata.normalize("NFKC", visible(text).translate(_SAME))
+    text = unicodedata.normalize("NFKC", text.casefold().translate(_SAME))
+    return str(float(text)) if is_plain_number(text) else text

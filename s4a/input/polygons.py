@@ -1,0 +1,194 @@
+"""Triangles of the polygons and triangle strips of mesh files (5, the data).
+
+Readers return polygons as a pair ``(corners, sizes)``: the concatenated corners of all polygons,
+and the number of corners of each.
+"""
+
+import numpy as np
+
+Polygons = tuple[np.ndarray, np.ndarray]
+_FLAT = 1e-6  # largest distance of corners from the plane of a planar polygon, in its extents
+_NEGATIVE = 1e-7  # largest share of the area of a triangle that may be folded over, by rounding
+_STARTS = 8  # corners of a polygon that are tried as the common corner of its triangles
+_WORK = 2e8  # corners that are tested for a polygon by ear clipping, after which it is refused
+
+
+def polygons(corners: np.ndarray, offsets: np.ndarray) -> Polygons:
+    """Return polygons by their sizes, given by offsets ``(p + 1,)`` into their corners ``(c,)``.
+
+    Raises
+    ------
+    ValueError
+        If offsets decrease, or exceed the number of corners.
+    """
+    decreasing = (offsets[1:] < offsets[:-1]).any()  # not by differences, which may overflow
+    if decreasing or (len(offsets) and (offsets[0] < 0 or offsets[-1] > len(corners))):
+        raise ValueError(f"polygons of {offsets[-1]} corners expected, found {len(corners)}")
+    if not len(offsets):
+        return corners[:0], offsets
+    return corners[offsets[0] : offsets[-1]], np.diff(offsets)
+
+
+def joined(parts: list[Polygons]) -> Polygons:
+    """Concatenate polygons."""
+    none = np.empty(0, np.int64)
+    corners, sizes = zip((none, none), *parts, strict=True)
+    return np.concatenate(corners), np.concatenate(sizes)
+
+
+def strips(corners: np.ndarray, sizes: np.ndarray) -> Polygons:
+    """Return the triangles of triangle strips; every second triangle of a strip is reversed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.input.polygons import strips
+    >>> corners, sizes = strips(np.array([0, 1, 2, 3]), np.array([4]))
+    >>> corners.reshape(-1, 3).tolist()
+    [[0, 1, 2], [3, 2, 1]]
+    """
+    # 1---3   0, 1, 2 and 3, 2, 1
+    # | \ |
+    # 0---2
+    first, step = _steps(sizes)
+    odd = step % 2
+    triangles = np.stack([first + step + 2 * odd, first + step + 1, first + step + 2 - 2 * odd], 1)
+    return corners[triangles].ravel(), np.full(len(triangles), 3)
+
+
+def _steps(sizes):
+    """First corner of the polygon of each triangle, and number of the triangle in its polygon."""
+    count = np.maximum(sizes - 2, 0)  # triangles of each polygon
+    first = np.repeat(np.cumsum(sizes) - sizes, count)
+    return first, np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+
+
+def triangulated(X: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, int]:
+    """Triangulate polygons; those of fewer than three corners give no triangle.
+
+    A planar polygon is cut into triangles from its first corner, if none of them is folded over.
+    Otherwise the common corner is the first one, in the order of vertices, from which none is; if
+    there is none, ears are clipped.  Area and volume do not depend on the order of the corners.
+
+    Parameters
+    ----------
+    X : float ndarray (n, 3)
+    corners : int ndarray (c,)
+        Vertices, from 0 to n - 1.
+    sizes : int ndarray (p,)
+
+    Returns
+    -------
+    T : int ndarray (m, 3)
+    n_crossing : int
+        Number of polygons that intersect themselves; the triangles of these are as good as any.
+
+    Raises
+    ------
+    ValueError
+        If a polygon is too complex.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.input.polygons import triangulated
+    >>> X = np.array([[0, 0, 0], [2, 0, 0], [0.5, 0.5, 0], [0, 2, 0]])  # concave at vertex 2
+    >>> triangulated(X, np.array([1, 2, 3, 0]), np.array([4]))[0].tolist()
+    [[0, 1, 2], [0, 2, 3]]
+    """
+    # 3---2   the first corner and each opposite side
+    # | / |
+    # 0---1
+    begin, count = np.cumsum(sizes) - sizes, np.maximum(sizes - 2, 0)
+    T, end, n_crossing = np.empty((count.sum(), 3), corners.dtype), np.cumsum(count), 0
+    reach = np.abs(X[np.isfinite(X)]).max(initial=0)
+    for size in np.unique(sizes[count > 0]).tolist():
+        which, at = np.flatnonzero(sizes == size), np.arange(size)
+        rows = corners[begin[which, None] + at]  # (q, size)
+        start, in_ears = _starts(X[rows], rows, reach)
+        rows = np.take_along_axis(rows, (start[:, None] + at) % size, axis=1)
+        common = np.broadcast_to(rows[:, :1], (len(rows), size - 2))
+        cut = np.stack([common, rows[:, 1:-1], rows[:, 2:]], axis=2)
+        for i in np.flatnonzero(in_ears):
+            ears, is_simple = _ears(X[rows[i]])
+            cut[i], n_crossing = rows[i][ears], n_crossing + (not is_simple)
+        T[(end - count)[which, None] + at[: size - 2]] = cut
+    return T, n_crossing
+
+
+def _starts(P, rows, reach):
+    """Corner from which each polygon is cut, and whether ears must be clipped instead.
+
+    Parameters
+    ----------
+    P : ndarray (q, c, 3)
+        Polygons of c corners.
+    rows : int ndarray (q, c)
+        Their vertices.
+    reach : float
+        Largest coordinate of the file, which says how much coordinates are rounded.
+    """
+    P, at = P - P.mean(axis=1, keepdims=True), np.arange(rows.shape[1])
+    N = np.cross(P, np.roll(P, -1, axis=1)).sum(axis=1)  # (q, 3), of twice the area
+    length = np.linalg.norm(N, axis=1)
+    height = np.abs(np.einsum("qci,qi->qc", P, N)).max(axis=1)
+    is_planar = ~(height > (_FLAT * np.abs(P).max(axis=(1, 2)) + 2e-7 * reach) * length)
+    order = np.argsort(rows, axis=1, kind="stable")
+    start, todo = order[:, 0].copy(), np.arange(len(rows))
+    for candidate in [np.where(is_planar, 0, start), *order[:, :_STARTS].T]:
+        turned = (candidate[todo, None] + at) % len(at)
+        Q = np.take_along_axis(P[todo], turned[..., None], axis=1)
+        Q = Q - Q[:, :1]
+        areas = np.einsum("qci,qi->qc", np.cross(Q[:, 1:-1], Q[:, 2:]), N[todo])
+        folded = (areas < -_NEGATIVE * length[todo, None] ** 2).any(axis=1)
+        start[todo[~folded]] = candidate[todo[~folded]]
+        todo = todo[folded]
+    start[todo] = order[todo, 0]
+    return start, np.isin(np.arange(len(rows)), todo)
+
+
+def _ears(P):
+    """Triangles ``(c - 2, 3)`` of a polygon ``(c, 3)`` by ear clipping, and whether it is simple.
+
+    Ears without area are clipped last, so corners on a straight side belong to a triangle.
+    """
+    P = P - P.mean(axis=0)
+    N = np.cross(P, np.roll(P, -1, axis=0)).sum(axis=0)
+    k = int(np.abs(N).argmax())
+    P = P[:, [(k + 1) % 3, (k + 2) % 3][:: 1 if N[k] > 0 else -1]]  # counter-clockwise
+    P = P / (np.abs(P).max() or 1.0)
+    left, ears, at, n_failed, is_simple, steps = list(range(len(P))), [], 0, 0, True, 0
+    while len(left) > 2:
+        steps += 1
+        if steps * len(P) > _WORK:
+            raise ValueError(
+                f"a concave polygon of {len(P)} corners is too complex: "
+                "save the surface as triangles"
+            )
+        n = len(left)
+        corners = [left[(at + i) % n] for i in (-1, 0, 1)]
+        turn = _turn(*P[corners])
+        is_ear = turn > 1e-12 and not _any_inside(P[corners], P[left])
+        if is_ear or (n_failed >= n and turn > -1e-12) or n_failed >= 2 * n:
+            is_simple &= turn > -1e-12
+            ears.append(corners)
+            left.pop(at % n)
+            at, n_failed = at % n, 0
+        else:
+            at, n_failed = at + 1, n_failed + 1
+    return np.array(ears), is_simple
+
+
+def _turn(a, b, c):
+    """Twice the area of triangles in the plane, positive if counter-clockwise."""
+    u, v = b - a, c - b
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+
+def _any_inside(triangle, points):
+    """Whether any of the points, other than the corners, is in a triangle or on its sides."""
+    inside = np.ones(len(points), bool)
+    for i in range(3):
+        inside &= _turn(triangle[i - 1], triangle[i], points) > -1e-12
+        inside &= (points != triangle[i]).any(axis=1)
+    return bool(inside.any())
