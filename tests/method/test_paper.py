@@ -19,6 +19,7 @@ import s4a
 from s4a.evaluation.methods import Pair, Spaces
 from s4a.method import latent
 from s4a.method.shape import Shape
+from s4a.options import PRESETS
 
 
 @pytest.fixture(scope="module")
