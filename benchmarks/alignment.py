@@ -39,11 +39,11 @@ from s4a.options import PRESETS
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 ALIGNMENTS = ("search", "icp", "given")
-SMALL = {"n_coarse": 500, "k": 40, "intersections": False}
+SMALL = {"n_coarse": 300, "k": 30, "n_samples": 300, "intersections": False}
 CLEAN = ("heads", "skulls", "faces", "faust_r", "kids", "hippocampi", "femurs", "femurs_sicas")
 CLEAN = (*CLEAN, "spleens", "vertebrae", "brains")
 SYMMETRIC = ("rods, bump 30 %", "rods, bump 10 %", "thin rods", "discs", "plain rods", "tori")
-ROTATED = {"hippocampi": 7, "femurs_sicas": 7, "faces": 5, "heads": 3, "tori": 4}
+ROTATED = {"hippocampi": 5, "tori": 4, "femurs_sicas": 4, "faces": 3, "heads": 2}
 
 
 def say(*cells):
@@ -93,7 +93,7 @@ def simulated(name):
     }
     for seed in range(5):
         mesh = torus(seed) if name == "tori" else bumpy(seed, *options[name])
-        yield from cleaned({f"{name.split()[0]}_{seed}": mesh}).items()
+        yield from cleaned({f"shape_{seed}": mesh}).items()
 
 
 def bumpy(seed, bump, axes):
