@@ -27,10 +27,11 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial.transform import Rotation
 
 import s4a
 from s4a import synthetic
-from s4a.geometry.align import cloud, icp
+from s4a.geometry.align import rigid_transform
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.initial_map import landmarks_after_alignment
@@ -100,12 +101,6 @@ def pyfm_fit(source, target, transform, *, k_init=20, init="landmarks", near=Non
     return model.FM_12, landmarks
 
 
-def one_start(X, area, Y, area_y):
-    """ICP from the pose as given alone, centroids on each other."""
-    shift = area_y @ Y / area_y.sum() - area @ X / area.sum()
-    return icp(cloud(X, area), cloud(Y, area_y), np.eye(3), shift)
-
-
 # what is put in the place of ours, where there is no switch
 INSTEAD = {
     "U by closest points in space": {"s4a.method.remesh.closest_point_in_star": closest_in_space},
@@ -113,7 +108,6 @@ INSTEAD = {
         "s4a.method.remesh.closest_point_in_star": closest_in_space,
         "s4a.method.remesh.sample_surface": geodesic_farthest,
     },
-    "ICP from one start": {"s4a.method.initial_map.align": one_start},
     "initial maps of pyFM": {"s4a.method.initial_map.fit_after_alignment": pyfm_fit},
     "weights of the linear program": {"s4a.method.latent.cycle_errors": program_errors},
 }
@@ -128,7 +122,8 @@ ON_THE_PAPER = {
     "n_samples": {"n_samples": DEFAULTS["n_samples"]},
     "dense_iterations": {name: DEFAULTS[name] for name in ("n_samples", "dense_iterations")},
     "articulated": {"refine": "elastic", "articulated": True},
-    "alignment": {"alignment": "fitted"},
+    "alignment": {"alignment": "search"},
+    "displacement_alignment": {"displacement_alignment": "fitted"},
     "area_weighted": {"area_weighted": True},
     "n_projected": {"n_projected": N_PROJECTED},
 }
@@ -140,6 +135,7 @@ READINGS = {
     "n_latent": 90,
     "step": 10,
     "isometric": True,
+    "alignment": "given",
 }
 NORMS = ("h2", "h1", "frobenius", "h2_image", "h2_both")
 OF_A_PAIR = ("refine", "init", "initial_refinement", "full_resolution_iterations", "bidirectional")
@@ -280,6 +276,40 @@ def errors(study, image):
     return 100 * np.mean(found, axis=0) / size
 
 
+def field_errors(study, image):
+    """Errors of rotation (degrees), displacement (% of sqrt(area)) and modes (mean |cos|).
+
+    The true displacement is that after the best rigid transform of the true positions.  Of each of
+    the first three principal components of true displacements, |cos| with the most similar of the
+    first three modes is taken.
+    """
+    registration = study["registration"].to_dataset()
+    template, X = registration.attrs["template"], registration["position"].values
+    area = registration["vertex_area"].values
+    others = [name for name in registration["shape"].values.tolist() if name != template]
+    angles, true, found = [], [np.zeros_like(X)], [np.zeros_like(X)]
+    for name in others:
+        one = registration.sel(shape=name)
+        Y = np.asarray(image(name, template))
+        R, t, _ = rigid_transform(Y, X, area)
+        off = Rotation.from_matrix(R @ one["icp_rotation"].values.T)
+        angles.append(np.rad2deg(off.magnitude()))
+        true.append(Y @ R.T + t - X)
+        found.append(one["displacement"].values)
+    distance = np.linalg.norm(np.subtract(found, true)[1:], axis=2).mean()
+    first, second = (_components(fields, area) for fields in (true, found))
+    cosine = np.abs(first @ second.T).max(1).mean()
+    return np.mean(angles), 100 * distance / np.sqrt(area.sum()), cosine
+
+
+def _components(fields, area):
+    """The first three principal components of fields (n, v, 3), orthonormal rows."""
+    rows = (np.subtract(fields, np.mean(fields, axis=0)) * np.sqrt(area)[:, None]).reshape(
+        len(fields), -1
+    )
+    return np.linalg.svd(rows, full_matrices=False)[2][:3]
+
+
 def carried_error(study, image):
     """Mean error of vertices of the template that are transferred, both ways where there are."""
     registration = study["registration"].to_dataset()
@@ -318,7 +348,9 @@ def measure(row, options, meshes, image, folder):
         carried = ""
     match, surface = errors(study, image)
     template = study["registration"].attrs["template"]
-    return [f"{match:.3f}", f"{surface:.3f}", carried, f"{seconds:.1f}", template]
+    rotation, displacement, cosine = field_errors(study, image)
+    fields = [f"{rotation:.2f}", f"{displacement:.3f}", f"{cosine:.2f}"]
+    return [f"{match:.3f}", f"{surface:.3f}", carried, f"{seconds:.1f}", template, *fields]
 
 
 def main():
