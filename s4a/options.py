@@ -9,7 +9,7 @@ import difflib
 import json
 import re
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import partial
 from importlib.util import find_spec
@@ -25,6 +25,7 @@ N_COARSE = 6000  # vertices of a low-resolution mesh, unless a preset sets it
 N_SAMPLES = 1000  # farthest-point samples at which Consistent ZoomOut searches
 N_CENTRAL = 25_000  # vertices used to project a field onto the eigenfunctions
 PER_FUNCTION = 2  # least number of samples per function, for a stable least-squares fit
+MILLIMETRES = {"um": 0.001, "mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}  # units of length
 FEATURE = re.compile(r"[A-Za-z0-9_-]{1,100}")  # valid in file names
 # options that method="scalable" does not support, and why
 WITHOUT_MESH = {
@@ -108,6 +109,13 @@ def check_components(components: Any) -> str | int:
     raise ValueError(
         f'components needs to be "largest", "all" or a number from 1; found {components!r}'
     )
+
+
+def check_unit(unit: Any) -> str:
+    """Return a unit of length; raise ValueError unless it is one of :data:`MILLIMETRES`."""
+    if unit not in MILLIMETRES:
+        raise ValueError(f"unit must be one of {', '.join(MILLIMETRES)}; found {unit!r}")
+    return str(unit)
 
 
 def check_label(label: Any) -> int | str | None:
@@ -268,6 +276,13 @@ class Options:
         "(NIfTI, MGH)",
         check=check_label, of="cleaning", more='``"all"`` means every label but 0, see '
         ":func:`s4a.read_labels` for the formats.  By default the files are meshes")
+    coordinate_system: str | None = reading(None,
+        "coordinate system of files that do not say theirs: RAS, LPS or 'surface RAS, c_ras X Y Z'",
+        of="cleaning", pair=True, more="Files of different systems are converted to the most "
+        "frequent one if all are known, and refused otherwise "
+        "(:mod:`s4a.input.coordinates`).  What a file says is never replaced")
+    unit: str | None = reading(None, "unit of files that do not say theirs: um, mm, cm, m or in",
+        check=check_unit, of="cleaning", pair=True)
     reflect: str | list[str] | None = reading(None,
         "shapes to mirror: names separated by commas, COLUMN=VALUE of the table, or 'auto'",
         more="Mirroring maps x to -x in the coordinates of the file and reverses the triangles, so "
@@ -438,6 +453,11 @@ class Options:
     include_flagged: bool = quality(False,
         "include suspect (flagged) shapes in the modes and statistics")
     # fmt: on
+
+    def __new__(cls, **given: Any) -> Self:
+        """Return the options; TypeError if one is unknown."""
+        check_known(given)
+        return super().__new__(cls)
 
     def __post_init__(self):
         settings = apply_preset(self.preset, vars(self), PRESETS)
@@ -623,12 +643,17 @@ def given_options(
     from s4a.seeds import seeded
 
     given = seeded(given)
+    check_known(given, pair=pair)
+    return Options(**given) if of is None else of.changed(given)
+
+
+def check_known(given: Iterable[str], *, pair: bool = False) -> None:
+    """Raise TypeError if a name is not that of an option, or of one of a single `pair`."""
     known = [name for name, one in DECLARED.items() if one.metadata["pair"] or not pair]
-    for name in given.keys() - set(known):
+    for name in set(given) - set(known):
         near = [] if name in DECLARED else difflib.get_close_matches(name, known, 1)
         said = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
         raise TypeError(f"unexpected option {name}{' of a pair' if pair else ''}; {said}")
-    return Options(**given) if of is None else of.changed(given)
 
 
 def _entry(one):

@@ -296,6 +296,7 @@ warning | shape | 1 | findings that were left as they are
 flag_kinds | shape | 1 | kinds of findings for which the shape is flagged
 warning_kinds | shape | 1 | kinds of other findings
 path | shape | 1 | file of the shape
+coordinate_system | shape | 1 | coordinate system and unit of that file
 area | shape | L2 | area of the surface
 self_intersections | shape | 1 | triangles that intersect others, -1 if not counted
 file_vertices | shape | 1 | vertices in the file
@@ -426,7 +427,7 @@ HOLDS = {
     ),
 }
 OMITTED = ("shape", "pair", "iteration")  # leading dims that a file of one of them lacks
-TEXTS = set("source target status reason warning path shape stage".split())
+TEXTS = set("source target status reason warning path coordinate_system shape stage".split())
 
 
 def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr.Variable:

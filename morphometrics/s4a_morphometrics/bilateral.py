@@ -18,7 +18,7 @@ import xarray as xr
 from scipy import stats
 
 from s4a.analysis.inputs import Values, displacements_of, labels_of, registration_of
-from s4a.analysis.permutation import Model, check_permutations
+from s4a.analysis.permutation import Model, check_count
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.closest import closest_facing_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, edges, vertex_areas, vertex_normals
@@ -231,7 +231,7 @@ def asymmetry(
     (('vertex', 'xyz'), 1.0)
     """
     seed = seed_of(seed, rng)
-    check_permutations(n_permutations)
+    check_count(n_permutations)
     if of not in ("vector", "normal"):
         raise ValueError(f"of must be 'vector' or 'normal', found {of!r}")
     if (subject is None) != (side is None):

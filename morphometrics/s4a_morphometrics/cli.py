@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import s4a
 from s4a.cli import command
-from s4a.cli.commands import study_to_test, write
+from s4a.cli.commands import SYSTEM, study_to_test, write
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -233,6 +233,7 @@ def export(
     template_landmarks: str | None = None,
     labels: str | None = None,
     grid: str | None = None,
+    **system: Any,
 ) -> int:
     """Write a study for Slicer, ShapeWorks, Scalismo, ParaView, R, or as label volumes.
 
@@ -263,7 +264,7 @@ def export(
     marks = read(template_landmarks) if template_landmarks else None
     label = template_labels(tree, labels)
     asked = {"n_points": points, "n_modes": modes, "landmarks": marks, "label": label, "grid": grid}
-    options = {name: value for name, value in asked.items() if value is not None}
+    options = {name: value for name, value in {**asked, **system}.items() if value is not None}
     paths = write_for(tree, out, to, **options)
     write(f"{len(paths)} files for {to} in {out}, such as {paths[-1].name}")
     return 0
@@ -273,4 +274,4 @@ ASYMMETRY = command(asymmetry, ("seed",))
 GROWTH = command(growth, ("seed",))
 COVARIATION = command(covariation, ("seed",))
 COMPLETE = command(complete, ("seed",))
-EXPORT = command(export)
+EXPORT = command(export, SYSTEM)

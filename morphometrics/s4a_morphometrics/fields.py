@@ -195,10 +195,13 @@ def write_field(study: xr.DataTree, name: str, folder: Path | str) -> Path:
         raise ValueError(f"the study has no field {name!r}; with_field adds one")
     field = study["fields"][name].to_dataset()
     registered = study["registration"].children
-    keys = [registered[shape].attrs.get("task_key", "") for shape in field["shape"].values.tolist()]
+    names = field["shape"].values.tolist()
+    keys = [registered[shape].attrs.get("task_key", "") for shape in names]
+    made_from = [f"registration/{shape}={key}" for shape, key in zip(names, keys, strict=True)]
     path = Path(folder) / "fields" / f"{name}.nc"
     with lock(folder) as claim:
-        write(field, path, task_key(field["transferred_field"].values, *keys), keys, claim)
+        key = task_key(field["transferred_field"].values, *keys)
+        write(field, path, key, made_from, claim, name=f"fields/{name}")
     return path
 
 

@@ -20,23 +20,26 @@ several resolutions Cerrolaza et al. 2015).  A structure is weighted by its area
 """
 
 import logging
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from s4a.analysis.inputs import registration_of
-from s4a.analysis.permutation import check_permutations
+from s4a.analysis.permutation import check_count
 from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.input.chirality import MIRROR, map_to_file
+from s4a.input.coordinates import file_system, map_between, moved
 from s4a.input.subjects import listed
 from s4a.method.pca import center_gram, gram, pca, principal_components
 from s4a.schema import check_switch, covariate, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 from s4a.study.insert import scores_of_new
-from s4a_morphometrics.several import of_structure, structure_names
+from s4a_morphometrics.several import of_structure, structure_names, subject_systems
 from s4a_morphometrics.two_block import coordinates, two_block
 
 log = logging.getLogger(__name__)
@@ -273,18 +276,14 @@ def structures(
     (1.0, 6)
     """
     seed = seed_of(seed, rng)
-    check_permutations(n_permutations)
+    check_count(n_permutations)
     check_switch("remove_size", remove_size)
     names = structure_names(study)
     registered = {name: registration_of(of_structure(study, name)) for name in names}
     shapes = shared_subjects(registered)
-    unit = shared_unit(registered)
+    Y, unit = positions(study, registered, shapes)
     meshes = [as_arrays(registered[name]) for name in names]
     areas = [vertex_areas(*mesh) for mesh in meshes]
-    Y = [
-        np.stack([image_in_shape(mesh[0], registered[name].sel(shape=shape)) for shape in shapes])
-        for name, mesh in zip(names, meshes, strict=True)
-    ]
     report_frames(names, Y, areas)
     counts = [len(area) for area in areas]
     vertices = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
@@ -302,6 +301,49 @@ def structures(
     return result.assign_coords(shape=shapes, structure=names, level=list(LEVELS[1:])).assign_attrs(
         remove_size=str(remove_size), permutations=n_permutations
     )
+
+
+def positions(
+    study: xr.DataTree, registered: dict[str, xr.Dataset], shapes: list[str], unit: str = ""
+) -> tuple[list[np.ndarray], str]:
+    """Return the registered surfaces of each structure, in one system per subject, and the unit.
+
+    Parameters
+    ----------
+    study : DataTree
+    registered : dict of str to Dataset
+        Registrations by structure.
+    shapes : list of str
+        The subjects.
+    unit : str
+        The unit to convert to, if it is known.
+
+    Returns
+    -------
+    list of float ndarray (s, n, 3)
+        Mirrored subjects are mirrored in the coordinates of the subject.
+    str
+    """
+    attrs: dict[str, dict[str, Any]] = {}
+    for name in registered:
+        part = of_structure(study, name)
+        meshes = part["original"].children if "original" in part.children else {}
+        attrs[name] = {shape: meshes[shape].attrs if shape in meshes else {} for shape in shapes}
+    files = {name: {s: file_system(a) for s, a in own.items()} for name, own in attrs.items()}
+    targets = subject_systems(files)
+    known = next(iter(targets.values())).unit
+    Y = []
+    for name, data in registered.items():
+        surfaces = []
+        for shape in shapes:
+            of_mesh, to_file = attrs[name][shape], map_to_file(attrs[name][shape])
+            target = replace(targets[shape], unit=unit if known and unit else known)
+            M = map_between(files[name][shape], target, f"{shape} ({name})") @ to_file
+            M = np.diag([*MIRROR, 1.0]) @ M if of_mesh.get("reflected") else M
+            X = image_in_shape(data["position"].values, data.sel(shape=shape))
+            surfaces.append(moved(X, M))
+        Y.append(np.stack(surfaces))
+    return Y, (unit or known) if known else shared_unit(registered)
 
 
 def measure_levels(
@@ -406,8 +448,9 @@ def structures_of_new(result: xr.Dataset, inserted: xr.DataTree) -> xr.Dataset:
     registered = {name: registration_of(of_structure(inserted, name)) for name in names}
     shapes = shared_subjects(registered, least=1)
     unit = unit_of(result["position"])
-    if shared_unit(registered) != unit:
-        raise ValueError(f"new shapes in {unit} needed, found {shared_unit(registered)}")
+    Y_of, unit_of_new = positions(inserted, registered, shapes, unit)
+    if unit_of_new != unit:
+        raise ValueError(f"new shapes in {unit} needed, found {unit_of_new}")
     vertices = vertices_of(result)
     counts = [len(v) for v in vertices]
     others = [registered[name].sizes["vertex"] for name in names]
@@ -421,9 +464,8 @@ def structures_of_new(result: xr.Dataset, inserted: xr.DataTree) -> xr.Dataset:
     mean = aligned.mean(0)
     center, size = w @ mean, np.sqrt(w @ (aligned[0] ** 2).sum(1))
     whole = np.empty((len(shapes), len(mean), 3))
-    for i, shape in enumerate(shapes):
-        parts = [registered[name].sel(shape=shape) for name in names]
-        Y = np.concatenate([image_in_shape(part["position"].values, part) for part in parts])
+    for i in range(len(shapes)):
+        Y = np.concatenate([surfaces[i] for surfaces in Y_of])
         Y -= w @ Y
         R, _, _ = rigid_transform(Y, mean, w)
         if result.attrs["remove_size"] == "True":

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from s4a.analysis.export import is_reflected, write_dataset, write_table
+from s4a.analysis.export import map_to_scan, write_dataset, write_table
 from s4a.analysis.inputs import registration_of
 from s4a.analysis.transfer import image_in_shape, transfer_labels, transfer_landmarks
 from s4a.analysis.volumes import write_label_volumes
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.input.annotations import write_landmarks
-from s4a.input.chirality import MIRROR, in_file
+from s4a.input.coordinates import CoordinateSystem, moved
 from s4a.input.files import write_mesh
-from s4a.input.formats import vtk_bytes, vtp_bytes
+from s4a.input.formats import vtp_bytes
 from s4a.input.landmarks import locate
 from s4a.method.pca import synthesize
 from s4a.schema import check_count, dataset, in_unit, unit_of, variable
@@ -108,8 +108,12 @@ def write_slicer(
     *,
     n_points: int = N_POINTS,
     landmarks: xr.Dataset | None = None,
+    coordinate_system: str | None = None,
+    unit: str | None = None,
 ) -> list[Path]:
     """Write registered surfaces and points for 3D Slicer, each in the frame of its file.
+
+    They are in millimetres if the unit is known, and in scanner RAS for files of FreeSurfer.
 
     Parameters
     ----------
@@ -122,6 +126,8 @@ def write_slicer(
         Number of farthest-point samples, the same vertices on every shape.
     landmarks : Dataset, optional
         Landmarks of the template, by default those of its file; transferred to all shapes.
+    coordinate_system, unit : str, optional
+        Of shapes whose files do not say theirs.
 
     Returns
     -------
@@ -140,32 +146,33 @@ def write_slicer(
             landmarks = locate(landmarks, study["original"][name].to_dataset())
         transferred = {name: landmarks}
         transferred |= {other: node.to_dataset() for other, node in others.items()}
-    unit, paths, unknown = unit_of(registration["displacement"]), [], []
+    given = CoordinateSystem.of({"coordinate_system": coordinate_system, "unit": unit})
+    paths, unknown = [], []
     names = np.array([str(vertex) for vertex in chosen.tolist()])
     for shape in registration["shape"].values.tolist():
         registered = registration.sel(shape=shape)
-        points, triangles, system = _in_file(study, shape, X, T, registered)
-        unknown += [] if system else [shape]
+        M, system = map_to_scan(study, shape, given, "mm")
+        points = moved(image_in_shape(X, registered), M)
+        triangles = T[:, ::-1] if np.linalg.det(M) < 0 else T
+        unknown += [] if system.axes else [shape]
         paths.append(folder / f"{shape}.vtk")
-        title = f"S4A; SPACE={system}" if system else "S4A"
-        scalars = {"confidence": registered["confidence"].values}
-        paths[-1].write_bytes(vtk_bytes(points, triangles, scalars, title))
+        confidence = registered["confidence"].values
+        write_mesh(paths[-1], points, triangles, **system.attrs, confidence=confidence)
         lists = {"points": dataset(landmark_name=names, landmark_position=points[chosen])}
         if shape in transferred:
             names_of_marks = [n for n in transferred[shape] if str(n) in MARKS]
             marks = transferred[shape][names_of_marks].drop_attrs()
-            mesh = study["original"][shape].to_dataset()
-            position = in_file(mesh, marks["landmark_position"].values)
+            position = moved(marks["landmark_position"].values, M)
             marks["landmark_position"] = variable("landmark_position", position)
             lists["landmarks"] = marks
         for kind, marks in lists.items():
             paths.append(folder / kind / f"{shape}.mrk.json")
-            marks = in_unit(marks, unit).assign_attrs(coordinate_system=system)
+            marks = in_unit(marks, system.unit).assign_attrs(system.attrs)
             write_landmarks(paths[-1], marks)
     if unknown:
         log.warning(
             "the files of %d shapes, such as %s, do not say whether they are RAS or LPS; 3D Slicer "
-            "takes them as LPS",
+            "takes them as LPS; coordinate_system= says it",
             len(unknown),
             unknown[0],
         )
@@ -361,14 +368,6 @@ def _folders(folder: Path | str, *names: str) -> Path:
     for path in (Path(folder), *(Path(folder) / name for name in names)):
         path.mkdir(parents=True, exist_ok=True)
     return Path(folder)
-
-
-def _in_file(study, name, X, T, registered):
-    """Return the registered surface in the frame of a shape's file, and the name of the frame."""
-    points, triangles = image_in_shape(X, registered), T
-    if is_reflected(study, name):
-        points, triangles = points * MIRROR, T[:, ::-1]
-    return points, triangles, study["original"][name].attrs.get("coordinate_system", "")
 
 
 def write_training_set(

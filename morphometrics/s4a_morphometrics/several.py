@@ -11,6 +11,7 @@ import logging
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -22,7 +23,8 @@ import s4a
 from s4a.input.annotations import write_rows
 from s4a.input.chirality import AUTO, to_reflect
 from s4a.input.collection import remarks_on_files
-from s4a.input.files import check_names, files_named, find_meshes, slug
+from s4a.input.coordinates import CoordinateSystem, common
+from s4a.input.files import check_names, files_named, find_meshes, slug, systems_of
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import shown
 from s4a.input.subjects import is_missing, listed, read_cells, subjects
@@ -98,7 +100,8 @@ def analyse_structures(
     ------
     ValueError
         As in :func:`s4a.analyse`, with the name of the structure; if there are fewer than two
-        structures, fewer than two subjects have one, or some structures of a subject are to be
+        structures, fewer than two subjects have one, the coordinate systems of a subject's
+        structures cannot be converted to each other, or some structures of a subject are to be
         mirrored and others are not.
 
     See Also
@@ -122,6 +125,7 @@ def analyse_structures(
     parts = parts_of(shapes, structures, settings.table, settings.landmarks, settings.pattern)
     remarks = check_parts(parts, marked=settings.landmarks is not None)
     remarks += remarks_on_files(shapes, settings.pattern, volumes=structures is not None)
+    check_systems(parts, settings)
     mirrored, chirality = None, None
     if settings.reflect == AUTO:
         cleaning = {
@@ -372,6 +376,41 @@ def check_parts(parts: Mapping[str, Part], *, marked: bool, least: int = 2) -> l
     return remarks
 
 
+def check_systems(parts: Mapping[str, Part], options: Options) -> None:
+    """Raise ValueError if structures of a subject cannot be converted to one coordinate system."""
+    given = CoordinateSystem.of(vars(options))
+    subject_systems(
+        {n: systems_of(part.shapes, given) for n, part in parts.items() if part.label is None}
+    )
+
+
+def subject_systems(
+    systems: Mapping[str, Mapping[str, CoordinateSystem]],
+) -> dict[str, CoordinateSystem]:
+    """Return a coordinate system for all structures of each subject, of the same axes and unit.
+
+    Parameters
+    ----------
+    systems : dict of str to dict
+        By structure and subject.
+
+    Raises
+    ------
+    ValueError
+        See :func:`s4a.input.coordinates.common`.
+    """
+    by_subject: dict[str, dict[str, CoordinateSystem]] = {}
+    for name, of_structure in systems.items():
+        for subject, system in of_structure.items():
+            by_subject.setdefault(subject, {})[f"{subject} ({name})"] = system
+    all_of_them = {name: s for own in by_subject.values() for name, s in own.items()}
+    shared = common(all_of_them)
+    return {
+        subject: replace(common(own, origin=True), axes=shared.axes, unit=shared.unit)
+        for subject, own in by_subject.items()
+    }
+
+
 def lacking(subjects_of: Mapping[str, Iterable[str]]) -> list[str]:
     """Return a remark for each subject that lacks a structure.
 
@@ -548,6 +587,8 @@ def insert_structures(
     landmarks: Path | str | None = None,
     reflect: str | list[str] | None = None,
     table: Path | str | None = None,
+    coordinate_system: str | None = None,
+    unit: str | None = None,
     compare: bool = True,
     n_jobs: int | None = None,
 ) -> xr.DataTree:
@@ -566,7 +607,7 @@ def insert_structures(
     reflect : str or list of str, optional
         New subjects to mirror: names, a column of the table, or ``"auto"`` for those of the other
         side than the subjects of the study; all structures of a subject are mirrored together.
-    compare, n_jobs : see :func:`s4a.insert`
+    coordinate_system, unit, compare, n_jobs : see :func:`s4a.insert`
 
     Returns
     -------
@@ -605,6 +646,9 @@ def insert_structures(
         raise ValueError(f"the study has no structure {listed(unknown)}; it has {listed(names)}")
     parts = {name: parts.get(name, Part({}, {}, {})) for name in names}
     remarks = check_parts(parts, marked=landmarks is not None, least=0)
+    system = {"coordinate_system": coordinate_system, "unit": unit}
+    system = {name: value for name, value in system.items() if value is not None}
+    check_systems(parts, Options.from_report(studies[names[0]]).changed(system))
     mirrored, lines = None, []
     if reflect == AUTO:
         given = {name: (studies[name], part.shapes) for name, part in parts.items() if part.shapes}
@@ -618,6 +662,7 @@ def insert_structures(
                 continue
             inputs = write_inputs(part._replace(rows={}), Path(folder), name)
             inputs |= {"reflect": mirrored_in(mirrored, part), "compare": compare, "n_jobs": n_jobs}
+            inputs |= system
             try:
                 inserted[name] = s4a.insert(studies[name], part.shapes, **inputs)
             except ValueError as error:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from s4a.cli.commands import new_folder, on_cluster, within, write
+from s4a.cli.commands import SYSTEM, new_folder, on_cluster, within, write
 from s4a.cli.flags import Command, add_options, whole
 from s4a.options import DECLARED
 
@@ -39,7 +39,9 @@ def insert(args: Namespace) -> int:
     from s4a_morphometrics.several import insert_structures, open_structures
 
     study = open_structures(args.study)
-    options = {name: getattr(args, name) for name in ("landmarks", "reflect", "table", "n_jobs")}
+    options = {
+        name: getattr(args, name) for name in ("landmarks", "reflect", "table", *SYSTEM, "n_jobs")
+    }
     inserted = insert_structures(study, args.shapes, **options)
     out = new_folder(args.out)
     path = write_inserted(inserted, out)
@@ -121,7 +123,7 @@ def _insert(add: Callable[..., Any]) -> None:
     text = "new subjects to mirror: names, with commas; COLUMN=VALUE of the table; or auto"
     add("--reflect", metavar="NAMES", help=text)
     add("--table", metavar="PATH", help=TABLE)
-    add_options(add, ["n_jobs"])
+    add_options(add, [*SYSTEM, "n_jobs"])
 
 
 def _compare(add: Callable[..., Any]) -> None:

@@ -11,7 +11,8 @@ from s4a.analysis.inputs import registration_of
 from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_rows
-from s4a.input.chirality import MIRROR
+from s4a.input.chirality import map_to_file
+from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved
 from s4a.input.files import write_mesh
 from s4a.study import store
 
@@ -59,7 +60,8 @@ def write_registered(
         All but OBJ include the ``confidence`` of every vertex.
     frame : {"template", "shape"}
         Aligned to the template, or in the coordinates of each shape's file, with mirrored shapes
-        reflected back; the unit is that of the input.
+        reflected back (:func:`s4a.write_mesh` says what the formats need); the unit is that of the
+        input.
     n_modes : int
         Number of modes in CSV files; the netCDF file has all.
 
@@ -112,23 +114,44 @@ def write_registered(
     folder.mkdir(parents=True, exist_ok=True)
     suffix = FORMATS[format]
     X, T = as_arrays(registration)
-    paths = []
+    paths, system = [], CoordinateSystem()
     for name in names:
         registered = registration.sel(shape=name)
         points, triangles = X + registered["displacement"].values, T
         if frame == "shape":
-            points = image_in_shape(X, registered)
-            if is_reflected(study, name):
-                points, triangles = points * MIRROR, T[:, ::-1]
+            M, system = map_to_scan(study, name)
+            points = moved(image_in_shape(X, registered), M)
+            triangles = T[:, ::-1] if np.linalg.det(M) < 0 else T
         has_scalars = format != "obj" and "confidence" in registered
         scalars = {"confidence": registered["confidence"].values} if has_scalars else {}
         paths.append(folder / f"{name}{suffix}")
-        write_mesh(paths[-1], points, triangles, **scalars)
+        write_mesh(paths[-1], points, triangles, **system.attrs, **scalars)
     paths.append(folder / f"template{suffix}")
     write_mesh(paths[-1], X, T)
     return paths + (
         _write_modes(study["pca"].to_dataset(), folder, n_modes) if "pca" in study else []
     )
+
+
+def map_to_scan(
+    study: xr.DataTree, name: str, given: CoordinateSystem | None = None, unit: str = ""
+) -> tuple[np.ndarray, CoordinateSystem]:
+    """Return the map (4, 4) of a shape to its file, or to scanner RAS, and that system.
+
+    Parameters
+    ----------
+    study : DataTree
+    name : str
+    given : CoordinateSystem, optional
+        Says what the file does not.
+    unit : str
+        Unit to convert to, if that of the file is known.
+    """
+    meshes = study["original"].children if "original" in study.children else {}
+    attrs = meshes[name].attrs if name in meshes else {"reflected": is_reflected(study, name)}
+    system = file_system(attrs).filled(given or CoordinateSystem())
+    written = system.in_world(unit=unit)
+    return map_between(system, written, name) @ map_to_file(attrs), written
 
 
 def is_reflected(study: xr.DataTree, name: str) -> bool:

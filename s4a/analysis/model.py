@@ -12,6 +12,7 @@ import xarray as xr
 from scipy import stats
 
 from s4a.analysis.inputs import displacements_of
+from s4a.analysis.permutation import check_count
 from s4a.geometry.closest import distance_to_surface
 from s4a.geometry.mesh import as_arrays
 from s4a.method.deform import smoother
@@ -379,7 +380,7 @@ def evaluate(
     Raises
     ------
     ValueError
-        If the study is not registered or has fewer than 4 shapes.
+        If the study is not registered or has fewer than 4 shapes, or a number is out of range.
 
     See Also
     --------
@@ -404,6 +405,10 @@ def evaluate(
     >>> bool(quality["generalization"][0] > quality["generalization"][3])
     True
     """
+    check_count(n_permutations)
+    check_count(n_samples, "n_samples", 2)
+    check_count(n_points, "n_points", 0)
+    check_count(n_surface, "n_surface", 2)
     registration, d, area = displacements_of(study)
     s = len(d)
     generator = np.random.default_rng(seed_of(seed, rng))
@@ -535,6 +540,7 @@ def sample(
     ('shape', 'component')
     """
     check_type(study, xr.DataTree)
+    check_count(n, "n", 0)
     most = study["pca"].sizes["component"]
     c = most if n_components is None else n_components
     if not 1 <= c <= most:

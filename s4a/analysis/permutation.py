@@ -27,15 +27,15 @@ INFLATED, MOST_INFLATED = 10.0, 1e4
 VARIANCES = ("equal", "unequal")
 
 
-def check_permutations(n: int) -> None:
-    """Raise ValueError unless the number of permutations is in range."""
-    if not 1 <= n <= MOST_PERMUTATIONS:
-        raise ValueError(f"n_permutations needs a number from 1 to {MOST_PERMUTATIONS}; found {n}")
+def check_count(n: int, name: str = "n_permutations", least: int = 1) -> None:
+    """Raise ValueError unless a number, of permutations by default, is in range."""
+    if not least <= n <= MOST_PERMUTATIONS:
+        raise ValueError(f"{name} needs a number from {least} to {MOST_PERMUTATIONS}; found {n}")
 
 
 def check_options(n_permutations: int, variances: str, seed: int) -> dict[str, Any]:
     """Return the options of a :class:`Model` after a check."""
-    check_permutations(n_permutations)
+    check_count(n_permutations)
     if variances not in VARIANCES:
         raise ValueError(f"variances must be 'equal' or 'unequal'; found {variances!r}")
     return {"n_permutations": n_permutations, "variances": variances, "seed": seed}

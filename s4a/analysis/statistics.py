@@ -40,7 +40,7 @@ from s4a.analysis.inputs import (
     with_flagged,
 )
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
-from s4a.analysis.permutation import Model, check_permutations, indicators
+from s4a.analysis.permutation import Model, check_count, indicators
 from s4a.method.pca import gram, principal_components
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
@@ -212,7 +212,7 @@ def classify(
     (6, 0.5)
     """
     seed = seed_of(seed, rng)
-    check_permutations(n_permutations)
+    check_count(n_permutations)
     sample = sample_of(study, group, "group")
     return classify_sample(sample, estimator, n_components, n_folds, n_permutations, seed)
 

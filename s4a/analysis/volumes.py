@@ -3,7 +3,6 @@
 A voxel whose centre is inside a shape gets the label of its nearest vertex.
 """
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +13,10 @@ from s4a.analysis.inputs import registration_of
 from s4a.analysis.transfer import transfer_labels
 from s4a.geometry.compiled import igl
 from s4a.geometry.mesh import as_arrays
-from s4a.input.annotations import RAS_TO_LPS
-from s4a.input.chirality import in_file
+from s4a.input.chirality import map_to_file
+from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved
 from s4a.input.labels import read_grid, voxels_marked
-from s4a.schema import unit_of
 
-log = logging.getLogger(__name__)
-
-MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001}
 VOLUMES = ("NIfTI", "MGH")
 
 
@@ -31,6 +26,8 @@ def write_label_volumes(
     *,
     label: np.ndarray | None = None,
     grid: Path | str | None = None,
+    coordinate_system: str | None = None,
+    unit: str | None = None,
 ) -> list[Path]:
     """Transfer labels of the template to every shape and write them as NIfTI volumes.
 
@@ -45,6 +42,8 @@ def write_label_volumes(
     grid : path, optional
         NIfTI or MGH volume that defines the voxel grid of every shape; by default the label volume
         from which each shape was extracted, with its labelled voxels.
+    coordinate_system, unit : str, optional
+        Of shapes whose files do not say theirs (:mod:`s4a.input.coordinates`).
 
     Returns
     -------
@@ -54,7 +53,8 @@ def write_label_volumes(
     ------
     ValueError
         If labels are missing or not integers, a shape was not extracted from a volume and `grid` is
-        not given, or no voxel is inside a shape.
+        not given, its coordinates cannot be converted to those of the volume, or no voxel is inside
+        a shape.
 
     See Also
     --------
@@ -94,14 +94,19 @@ def write_label_volumes(
             f"a label volume needs integers under {2**31}; found {label.dtype}: number the labels "
             "first"
         )
-    grids = {name: _grid_of(study, name, grid) for name in names}  # before any file is written
+    # before any file is written
+    grids = {name: _grid_of(study, name, grid) for name in names}
+    given = CoordinateSystem.of({"coordinate_system": coordinate_system, "unit": unit})
+    maps = {
+        name: _map_to(grids[name][0], study["original"][name].attrs, given, name) for name in names
+    }
     transferred = transfer_labels(study, label, targets=names)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for name in names:
         mesh = study["original"][name].to_dataset()
-        volume = _volume(mesh, name, transferred[name]["label"].values, *grids[name])
+        volume = _volume(mesh, maps[name], name, transferred[name]["label"].values, *grids[name])
         paths.append(folder / f"{name}.nii.gz")
         _save(paths[-1], *volume)
     return paths
@@ -125,18 +130,24 @@ def _grid_of(study, name, grid):
     return attrs["path"], attrs["label"]
 
 
-def _volume(mesh, name, label, grid, source_label):
+def _map_to(grid, attrs, given, name):
+    """Map (4, 4) of a mesh, which the run may have mirrored or converted, to a volume."""
+    file = file_system(attrs).filled(given)
+    system = read_grid(grid)[2]
+    return map_between(file, system, f"{name}, to be written in {grid},") @ map_to_file(attrs)
+
+
+def _volume(mesh, M, name, label, grid, source_label):
     """Labels at the voxels of a grid ``(x, y, z)``, and the affine map."""
     Y, S = as_arrays(mesh)
-    Y, S = (in_file(mesh, Y), S[:, ::-1]) if mesh.attrs.get("reflected") else (Y, S)
-    Y = _in_millimetres(mesh, name, Y)
+    Y, S = moved(Y, M), S[:, ::-1] if np.linalg.det(M) < 0 else S
     if source_label is not None:
         inside, affine = voxels_marked(grid, source_label)
         voxel = np.argwhere(inside)
         centre = voxel @ affine[:3, :3].T + affine[:3, 3]
         shape = inside.shape
     else:
-        shape, affine = read_grid(grid)
+        shape, affine, _ = read_grid(grid)
         voxel, centre = _voxels_within(Y, S, shape, affine)
         if not len(voxel):
             raise ValueError(
@@ -147,20 +158,6 @@ def _volume(mesh, name, label, grid, source_label):
     values = np.zeros(shape, np.int32)
     values[tuple(voxel.T)] = label[cKDTree(Y).query(centre)[1]]
     return values, affine
-
-
-def _in_millimetres(mesh, name, Y):
-    """Positions in millimetres, RAS."""
-    unit, system = unit_of(mesh["position"]), mesh.attrs.get("coordinate_system", "")
-    if unit not in MILLIMETRES or not system:
-        log.warning(
-            "unit or coordinate system of %s are unknown (%s, %s): millimetres and RAS are assumed",
-            name,
-            unit,
-            system or "unknown",
-        )
-    Y = Y * MILLIMETRES.get(unit, 1.0)
-    return Y * RAS_TO_LPS if system == "LPS" else Y
 
 
 def _voxels_within(Y, S, shape, affine):

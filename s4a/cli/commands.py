@@ -59,8 +59,20 @@ def doctor(folder: str = ".") -> int:
     return 1 if missing else 0
 
 
+def exit_code(report: "xr.Dataset", fail_on: str, otherwise: int) -> int:
+    """Return 3 if a shape of a report has a status that --fail-on names, or a worse one."""
+    failed = {"none": [], "excluded": ["excluded"], "flagged": ["flagged", "excluded"]}[fail_on]
+    return 3 if report["status"].isin(failed).any() else otherwise
+
+
 def run(
-    paths: list[str], *, out: str, cluster: str | None = None, words: list[str], **options: Any
+    paths: list[str],
+    *,
+    out: str,
+    cluster: str | None = None,
+    fail_on: Literal["none", "excluded", "flagged"] = "none",
+    words: list[str],
+    **options: Any,
 ) -> int:
     """Analyse a folder of meshes: correspondences, median shape, modes of variation.
 
@@ -72,6 +84,8 @@ def run(
         folder of the study; an unfinished one is resumed
     cluster : ADDRESS
         dask scheduler tcp://host:port, or local:N worker processes
+    fail_on
+        end with exit code 3 if shapes were excluded, or if shapes were flagged or excluded
 
     Examples
     --------
@@ -87,7 +101,7 @@ def run(
     lines = [tables.report_table(report), *tables.cost_lines(report)]
     full.write_text("\n".join(lines) + "\n", encoding="utf-8")
     write(tables.run_summary(study, again=again), *tables.place_lines(out, str(full)))
-    return 1 if study["report"].attrs["unforeseen"] else 0
+    return exit_code(report, fail_on, 1 if study["report"].attrs["unforeseen"] else 0)
 
 
 @contextlib.contextmanager
@@ -216,8 +230,11 @@ def view(
     up
         axis that points up
     """
+    tree = s4a.open_study(study)
     file = Path(page) if page else within(study, "study.html")
-    s4a.write_page(s4a.open_study(study), file, title=title or Path(study).name, view=view, up=up)
+    if file.is_dir() or not file.parent.is_dir():
+        raise ValueError(f"--page needs a file in an existing folder; found {page}")
+    s4a.write_page(tree, file, title=title or Path(study).name, view=view, up=up)
     write(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)")
     return 0
 
@@ -348,7 +365,9 @@ def insert(
     out: str,
     landmarks: str | None = None,
     reflect: str | None = None,
+    fail_on: Literal["none", "excluded", "flagged"] = "none",
     n_jobs: int,
+    **system: Any,
 ) -> int:
     """Register new shapes to a finished study, which stays unchanged.
 
@@ -364,15 +383,19 @@ def insert(
         folder of landmark files named as the shapes, which guide registration
     reflect : NAMES
         new shapes to mirror: names separated by commas; or auto, those mirrored to the study
+    fail_on
+        end with exit code 3 if shapes were excluded, or if shapes were flagged or excluded
     """
     tree = s4a.open_study(study)
-    inserted = s4a.insert(tree, shapes, landmarks=landmarks, reflect=reflect, n_jobs=n_jobs)
+    given = {"landmarks": landmarks, "reflect": reflect, "n_jobs": n_jobs} | system
+    inserted = s4a.insert(tree, shapes, **given)
     folder = new_folder(out)
     path = s4a.study.tree.write_inserted(inserted, folder)
     s4a.write_registered(inserted, folder)
     write(tables.inserted_table(inserted), "")
     write(f"written: {path}, registered meshes and scores in {folder}")
-    return 1 if (inserted["report"]["status"] == "excluded").any() else 0
+    report = inserted["report"].to_dataset()
+    return exit_code(report, fail_on, 1 if (report["status"] == "excluded").any() else 0)
 
 
 def transfer(
@@ -496,7 +519,7 @@ def file_points(mesh: "xr.Dataset") -> "np.ndarray":
     path, label = mesh.attrs.get("path") or "", mesh.attrs.get("label")
     if Path(path).is_file():
         read = s4a.input.labels.read_volume(path, label) if label else s4a.read_mesh(path)
-        return s4a.input.chirality.in_file(mesh, read[0])
+        return s4a.input.chirality.in_file(mesh, read[0], back=True)
     points = np.full((mesh.sizes["file_vertex_index"], 3), np.nan)
     points[mesh["file_vertex"].values] = mesh["position"].values
     return points
@@ -511,6 +534,7 @@ def compare(
     landmarks: list[str] | None = None,
     keep: bool = False,
     out: str = "compare",
+    preset: Literal["paper"] | None = None,
     n_pairs: int,
     **options: Any,
 ) -> int:
@@ -535,8 +559,10 @@ def compare(
         also write meshes, matches and maps to compare.nc, for s4a.widgets.Comparison
     out : FOLDER
         folder for compare.nc and compare.png
+    preset
+        the methods and options of the paper
     """
-    options["n_coarse"] = options["n_coarse"] or N_COARSE
+    options |= {"preset": preset, "n_coarse": options["n_coarse"] or N_COARSE}
     if collection:
         if paths or truth or landmarks or keep:
             raise ValueError(
@@ -658,7 +684,8 @@ def write(*texts: str) -> None:
 
 
 OF_PAIRS = [name for name, one in DECLARED.items() if one.metadata["pair"]]
-CLEANING = ("components", "pattern", "label", "strict", "close_holes", "intersections")
+SYSTEM = ("coordinate_system", "unit")
+CLEANING = ("components", "pattern", "label", "strict", "close_holes", "intersections", *SYSTEM)
 COMMANDS = {
     "doctor": command(doctor),
     "check": command(check, CLEANING),
@@ -668,7 +695,7 @@ COMMANDS = {
     "demo": command(demo, ("preset", "n_jobs", "seed")),
     "view": command(view),
     "statistics": command(statistics, ("seed",)),
-    "insert": command(insert, ("n_jobs",)),
+    "insert": command(insert, ("n_jobs", *SYSTEM)),
     "transfer": command(transfer, (*OF_PAIRS, "n_jobs"), unset=True),
-    "compare": command(compare, ("n_coarse", "n_pairs", "k", "preset", "seed")),
+    "compare": command(compare, ("n_coarse", "n_pairs", "k", "seed")),
 }

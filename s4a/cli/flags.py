@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, Union, get_args, get_origin
 
 from s4a.options import DECLARED
 
@@ -141,7 +141,9 @@ def kind_of(annotation: Any) -> tuple[dict[str, Any], bool]:
     >>> kind_of(list[str] | None)
     ({'type': <class 'str'>}, True)
     """
-    kinds = set(get_args(annotation)) if isinstance(annotation, UnionType) else {annotation}
+    kinds = (
+        set(get_args(annotation)) if get_origin(annotation) in (Union, UnionType) else {annotation}
+    )
     kinds -= {NoneType}
     if len(kinds) == 1:
         (kind,) = kinds

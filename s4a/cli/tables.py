@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import lazy_loader
 
 import s4a
+from s4a.input.raw import sentences
 
 if TYPE_CHECKING:
     import numpy as np
@@ -118,10 +119,11 @@ def report_table(report: "xr.Dataset") -> str:
         shape = report.sel(shape=name)
         counts = [int(shape[count]) if count in shape else -1 for count in COUNTS]
         cells = ["-" if count < 0 else count for count in counts]
-        rows.append([name, *cells, shape["status"].item()])
+        system = shape["coordinate_system"].item() if "coordinate_system" in shape else ""
+        rows.append([name, *cells, shape["status"].item(), system])
         warning = shape["warning"].item()
         texts.append([shape["reason"].item(), f"warning: {warning}" if warning else ""])
-    head, *lines = table(rows, ["shape", *COUNTS.values(), "status"]).splitlines()
+    head, *lines = table(rows, ["shape", *COUNTS.values(), "status", "coordinates"]).splitlines()
     whole = [head]
     for line, below in zip(lines, texts, strict=True):
         whole.append(line)
@@ -182,10 +184,8 @@ def status_lines(status: "Status", now: float) -> str:
         [name, *stage_cells(status.stages.get(name), goes_on, now)] for name in dict.fromkeys(known)
     ]
     lines = [heads[status.state], table(rows, ["stage", "done", "of", "s", "peak MiB", "s left"])]
-    lines += [
-        f"left out: {name}: {without_middle(why, SCREEN)}" for name, why in status.failures.items()
-    ]
-    return "\n".join(with_rest(lines, 2 + LEAST))
+    failures = [sentence_lines(f"left out: {n}: ", why) for n, why in status.failures.items()]
+    return "\n".join([*lines, *with_rest(failures, LEAST)])
 
 
 def stage_cells(stage: "Stage | None", goes_on: bool, now: float) -> list[str]:
@@ -202,9 +202,19 @@ def stage_cells(stage: "Stage | None", goes_on: bool, now: float) -> list[str]:
     ]
 
 
-def with_rest(lines: list[str], most: int) -> list[str]:
-    """Return at most so many lines, and one with the number of the others."""
-    return lines if len(lines) <= most else [*lines[:most], f"  and {len(lines) - most} more"]
+def with_rest(texts: list[list[str]], most: int) -> list[str]:
+    """Return the lines of some texts, the first and others up to `most` lines, and how many more.
+
+    Examples
+    --------
+    >>> from s4a.cli.tables import with_rest
+    >>> with_rest([["a", "goes on"], ["b"], ["c"]], 3)
+    ['a', 'goes on', 'b', '  and 1 more']
+    """
+    ends = np.cumsum([len(lines) for lines in texts])
+    n = max(int((ends <= most).sum()), 1)
+    more = [f"  and {len(texts) - n} more"] if len(texts) > n else []
+    return [*itertools.chain.from_iterable(texts[:n]), *more]
 
 
 def run_summary(study: "xr.DataTree", *, again: str = "s4a run FOLDER --out STUDY") -> str:
@@ -333,25 +343,14 @@ def excluded_lines(report: "xr.Dataset", most: int) -> list[str]:
     width, lines = max(map(len, names)), []
     for name, reason, path in zip(names, out["reason"].values, out["path"].values, strict=True):
         head = f"  {name.ljust(width)}  "
-        lines.append(head + without_middle(short_reason(reason, path), SCREEN - len(head)))
+        lines.append(sentence_lines(head, short_reason(reason, path)))
     head = f"{len(names)} of {report.sizes['shape']} shapes cannot be used:"
     return [head, *with_rest(lines, most), ""]
 
 
-def without_middle(text: str, longest: int) -> str:
-    """Return a text of at most so many characters, without the words in its middle if needed.
-
-    Examples
-    --------
-    >>> from s4a.cli.tables import without_middle
-    >>> without_middle("one of PLY, OBJ, OFF, STL expected, found 14 bytes", 36)
-    'one of PLY, OBJ, … found 14 bytes'
-    """
-    if len(text) <= longest:
-        return text
-    half = (longest - 3) // 2
-    first, last = (textwrap.shorten(end, half, placeholder="") for end in (text, text[::-1]))
-    return f"{first} … {last[::-1]}".strip()
+def sentence_lines(head: str, text: str) -> list[str]:
+    """Return a head and the first sentences of a text, one at least, in lines of a screen."""
+    return wrapped(f"{head}{sentences(text, SCREEN - len(head))}", SCREEN, "", " " * len(head))
 
 
 def short_reason(reason: str, path: str) -> str:
@@ -372,10 +371,10 @@ def short_reason(reason: str, path: str) -> str:
 
 
 def remark_lines(report: "xr.Dataset") -> list[str]:
-    """Return the remarks on the collection, shortened, and the warnings by kind."""
+    """Return sentences of the remarks on the collection, and the warnings by kind."""
     remarks = report.attrs["remarks"].splitlines()
-    lines = [f"  {without_middle(line, SCREEN - 2)}" for line in remarks]
-    lines = [*with_rest(lines, MOST_REMARKS), *kind_lines(s4a.input.plausibility.notices(report))]
+    texts = [sentence_lines("  ", line) for line in remarks]
+    lines = [*with_rest(texts, MOST_REMARKS), *kind_lines(s4a.input.plausibility.notices(report))]
     return ["to know:", *lines, ""] if lines else []
 
 

@@ -16,9 +16,11 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from s4a.input.coordinates import CoordinateSystem
 from s4a.input.files import stem_of
 from s4a.input.formats import gifti_arrays, ply_properties
 from s4a.input.raw import check_there, content, npy, npz, reading, shown, text_of, xml
+from s4a.options import MILLIMETRES
 from s4a.schema import dataset, require, unit_of
 
 LONGEST = 255  # characters of a name, as NumPy pads each text to the longest
@@ -27,7 +29,6 @@ _MARKUPS = (
     "Resources/Schema/markups-schema-v1.0.3.json#"
 )
 _FORMULA = r"[=+@\t\r-]."  # the beginning of a cell that a spreadsheet evaluates
-RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])  # and back
 
 
 def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
@@ -146,13 +147,18 @@ def _annot_labels(data):
     if not file.number():
         raise ValueError("a colour table expected, found none")
     row_of_colour = _colour_table(file)
-    unknown = [value for value in np.unique(annotation).tolist() if value not in row_of_colour]
+    # -1 and 0 are no region; a value may have the colour's alpha, or not
+    rows = {
+        value: row_of_colour.get(value, row_of_colour.get(value % 2**24))
+        for value in np.unique(annotation).tolist()
+    } | {-1: -1}
+    unknown = [value for value, row in rows.items() if row is None]
     if unknown:
         raise ValueError(
             f"annotations of the colour table expected, found {unknown[:3]}, which are not in it"
         )
-    rows = [row_of_colour[value] for value in annotation.tolist()]
-    return np.array(rows, np.int64)[np.argsort(vertex)]
+    of_vertex = [rows[value] for value in annotation.tolist()]
+    return np.array(of_vertex, np.int64)[np.argsort(vertex)]
 
 
 def _colour_table(file):
@@ -168,9 +174,10 @@ def _colour_table(file):
     for i in range(file.number() if numbered else count):
         row = file.number() if numbered else i
         file.take(file.number())  # name of the structure
-        red, green, blue, _ = file.numbers(4).tolist()
-        row_of_colour.setdefault(red + 256 * green + 65536 * blue, row)
-    return row_of_colour | {0: -1}
+        colour = np.array(file.numbers(4), "u1").view("<i4").item()
+        row_of_colour.setdefault(colour, row)
+    opaque = {colour % 2**24: row for colour, row in row_of_colour.items()}
+    return opaque | row_of_colour | {0: -1}
 
 
 def table_rows(text: str) -> dict[int, list[str]]:
@@ -313,28 +320,35 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
     Parameters
     ----------
     path : str or Path
-        3D Slicer .mrk.json (points, curves, closed curves), CSV ``name,x,y,z`` (a header is
-        optional; with one, also ``curve``, the name of the curve or empty, and ``closed``), or the
-        XML of MeshLab's picked points (.pp).  Files may be compressed by gzip.
+        3D Slicer .mrk.json (points, curves, closed curves), .fcsv or CSV (``label,l,p,s``); CSV
+        ``name,x,y,z`` (a header is optional; with one, also ``curve``, the name of the curve or
+        empty, and ``closed``); TPS, ``FILE.tps:ID`` if it has several specimens; .pts; Scalismo's
+        JSON; or the XML of MeshLab's picked points (.pp).  Files may be compressed by gzip.
 
     Returns
     -------
     Dataset
         ``landmark_name(landmark)``, ``landmark_position(landmark, xyz)``; for curves, the points in
-        order with ``landmark_curve`` and ``landmark_closed``; attribute ``coordinate_system``, RAS
-        or LPS, empty if unknown.
+        order with ``landmark_curve`` and ``landmark_closed``; attributes ``coordinate_system`` and
+        ``unit`` if the file has them (:mod:`s4a.input.coordinates`).
 
     Raises
     ------
     ValueError
         If the file is missing or has no points, or a curve has only one point.
     """
-    path = Path(path)
+    before, tps, specimen = str(path).partition(".tps:")
+    path = Path(f"{before}.tps" if tps else path)
     check_there(path)
     with reading(path, "landmarks"):
         text = text_of(content(path))
-        reader = {"{": _slicer_points, "<": _meshlab_points}.get(text.lstrip()[:1], _table_points)
-        names, points, system, curve, closed = reader(text)
+        first = text.lstrip()[:1]
+        reader = {"{": _slicer_points, "[": _scalismo_points, "<": _meshlab_points}.get(first)
+        if re.match(r"\s*LM3?\s*=", text, re.I):
+            text, reader = _specimen(text, specimen), _tps_points
+        elif re.match(r"\s*version\b", text, re.I):
+            reader = _pts_points
+        names, points, system, curve, closed = (reader or _table_points)(text)
         points = np.array(points, float).reshape(-1, 3)
         if len(points) == 0 or not np.isfinite(points).all():
             raise ValueError(f"points with finite coordinates needed, found {len(points)}")
@@ -346,7 +360,55 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
     data = {"landmark_name": np.array(names), "landmark_position": points}
     if any(curve):
         data |= {"landmark_curve": np.array(curve), "landmark_closed": np.array(closed, bool)}
-    return dataset({"coordinate_system": system}, **data)
+    return dataset(system.attrs, **data)
+
+
+def _specimen(text, name):
+    """Lines of one specimen of a TPS file."""
+    specimens = re.split(r"(?im)^\s*(?=LM3?\s*=)", text)[1:]
+    ids = [
+        found[1] if (found := re.search(r"(?im)^ID\s*=\s*(.*?)\s*$", s)) else "" for s in specimens
+    ]
+    chosen = [s for s, one in zip(specimens, ids, strict=True) if not name or one == name]
+    if len(chosen) != 1:
+        raise ValueError(
+            f"one specimen needed, found {', '.join(ids)}: choose one as FILE.tps:{ids[0]}"
+        )
+    return chosen[0]
+
+
+def _tps_points(text):
+    head, *lines = [line.strip() for line in text.splitlines() if line.strip()]
+    n = int(head.partition("=")[2])
+    scale = re.search(r"(?im)^SCALE\s*=\s*(\S+)", text)
+    points = [line.split() for line in lines[:n] if "=" not in line]
+    others = [line for line in lines[n:] if not re.match(r"(?i)(ID|IMAGE|SCALE|COMMENT)\s*=", line)]
+    if others:
+        raise ValueError(f"{n} points and their ID needed, found the line {others[0][:40]!r}")
+    return _numbered(points, n, float(scale[1]) if scale else 1.0)
+
+
+def _pts_points(text):
+    """Points of IDAV's Landmark editor, or of other files that begin with a version."""
+    head, *lines = [line.strip() for line in text.splitlines()[1:] if line.strip(" \t{}")]
+    rows = [line.split() for line in lines]
+    names = [row.pop(0) if len(row) == 4 else "" for row in rows]
+    return names, *_numbered(rows, int(head.split()[-1]))[1:]
+
+
+def _numbered(points, n, scale=1.0):
+    """Landmarks of unknown names and coordinate system; ValueError unless n points in 3D."""
+    if len(points) != n or any(len(point) != 3 for point in points):
+        found = {len(point) for point in points}
+        raise ValueError(f"{n} points of 3 coordinates needed, found {len(points)} of {found}")
+    points = scale * np.array(points, float).reshape(-1, 3)
+    return [""] * n, points, CoordinateSystem(), [""] * n, []
+
+
+def _scalismo_points(text):
+    marks = json.loads(text)
+    points = [mark["coordinates"] for mark in marks]
+    return [mark["id"] for mark in marks], *_numbered(points, len(points))[1:]
 
 
 def _slicer_points(text):
@@ -369,25 +431,42 @@ def _slicer_points(text):
             for p in points
         ]
     labels, positions, curves, closed = zip(*rows, strict=True) if rows else ((),) * 4
-    return labels, positions, systems.pop(), curves, closed
+    units = {u for m in lists for u in np.ravel(m.get("coordinateUnits") or "mm").tolist()}
+    if len(units) != 1 or not units <= {*MILLIMETRES}:
+        raise ValueError(f"one of {', '.join(MILLIMETRES)} as unit needed, found {sorted(units)}")
+    system = CoordinateSystem(systems.pop(), "", units.pop())
+    return labels, positions, system, curves, closed
 
 
 def _meshlab_points(text):
     points = [p for p in xml(text).iter("point") if p.get("active") != "0"]
     names = [p.get("name", "") for p in points]
-    return names, [[p.get(axis) for axis in "xyz"] for p in points], "", [""] * len(names), []
+    positions = [[p.get(axis) for axis in "xyz"] for p in points]
+    return names, positions, CoordinateSystem(), [""] * len(names), []
 
 
 def _table_points(text):
-    rows = table_rows(text)
+    system, columns = CoordinateSystem(), re.compile(r"(?m)^#\s*columns\s*=\s*")
+    if columns.search(text):  # .fcsv of 3D Slicer, of old versions without a system, or with 0
+        found = re.search(r"(?m)^#\s*CoordinateSystem\s*=\s*(\w+)", text)
+        axes = found[1] if found else "0"
+        axes = {"0": "RAS", "1": "LPS"}.get(axes, axes)
+        system = CoordinateSystem.of({"coordinate_system": axes, "unit": "mm"})
+    rows = table_rows(columns.sub("", text, count=1))
     header = next(iter(rows.values()))
     head = [cell.lower() for cell in header]
     name, curve, closed = None, None, None
-    if all(axis in head for axis in "xyz"):
-        x = [head.index(axis) for axis in "xyz"]
+    letters = next((axes for axes in ("xyz", "lps", "ras") if {*axes} <= {*head}), "")
+    if letters:
+        x = [head.index(axis) for axis in letters]
         name = next((head.index(n) for n in ("name", "label", "landmark") if n in head), None)
         curve, closed = (head.index(n) if n in head else None for n in ("curve", "closed"))
         del rows[next(iter(rows))]
+        if letters != "xyz":  # of 3D Slicer
+            system = CoordinateSystem(letters.upper(), "", "mm")
+        if "defined" in head:
+            at = head.index("defined")
+            rows = {line: row for line, row in rows.items() if row[at : at + 1] != ["0"]}
     elif len(head) in (3, 4) and all(map(is_number, header[-3:])):
         x = list(range(len(head) - 3, len(head)))
         name = 0 if len(head) == 4 else None
@@ -401,7 +480,7 @@ def _table_points(text):
     return (
         names,
         [[_number_of(row[i], line) for i in x] for line, row in rows.items()],
-        "",
+        system,
         curves,
         [c.lower() in ("1", "true", "yes") for c in is_closed],
     )
@@ -430,7 +509,7 @@ def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
 
 def _markups(landmarks):
     """Content of a file of markups, as 3D Slicer writes it."""
-    system = str(landmarks.attrs.get("coordinate_system") or "LPS")
+    system = CoordinateSystem.of(landmarks.attrs).axes or "LPS"
     unit = unit_of(landmarks["landmark_position"])
     frame = {"coordinateSystem": system} | ({"coordinateUnits": unit} if unit == "mm" else {})
     upright = 1.0 if system == "RAS" else -1.0  # the axes of a point are those of RAS

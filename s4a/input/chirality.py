@@ -6,11 +6,13 @@ eigenvector of the matrix of comparisons, so that no single shape decides.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from s4a.input.columns import check_column
+from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved, transformed
 from s4a.input.subjects import listed
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -40,23 +42,22 @@ def mirror_image(mesh: xr.Dataset) -> xr.Dataset:
     >>> abs(volume(*as_arrays(image)) - volume(*as_arrays(mesh))) < 1e-9
     True
     """
-    image = mesh.copy()
-    for name in ("position", "landmark_position", "guide_position"):
-        if name in mesh:
-            image[name] = mesh[name].copy(data=mesh[name].values * MIRROR)
-    for name in ("landmark_barycentric", "guide_barycentric"):
-        if name in mesh:
-            image[name] = mesh[name].copy(data=mesh[name].values[:, ::-1])
-    flipped = np.ascontiguousarray(mesh["corner_vertex"].values[:, ::-1])
-    image["corner_vertex"] = mesh["corner_vertex"].copy(data=flipped)
+    image = transformed(mesh, np.diag([*MIRROR, 1.0]))
     reasons = [mesh.attrs.get("reason", ""), "mirrored by reflect="]
     reflected = 1 - mesh.attrs.get("reflected", 0)
     return image.assign_attrs(reflected=reflected, reason="; ".join(filter(None, reasons)))
 
 
-def in_file(mesh: xr.Dataset, X: np.ndarray) -> np.ndarray:
-    """Transform points ``(n, 3)`` of a mesh to the frame of its file, or back."""
-    return X * MIRROR if mesh.attrs.get("reflected") else X
+def map_to_file(attrs: Mapping[Any, Any]) -> np.ndarray:
+    """Return the map (4, 4) of a mesh with these attributes to the coordinates of its file."""
+    M = np.diag([*MIRROR, 1.0]) if attrs.get("reflected") else np.eye(4)
+    return map_between(CoordinateSystem.of(attrs), file_system(attrs), "a mesh") @ M
+
+
+def in_file(mesh: xr.Dataset, X: np.ndarray, *, back: bool = False) -> np.ndarray:
+    """Transform points ``(n, 3)`` of a mesh to the coordinates of its file, or back."""
+    M = map_to_file(mesh.attrs)
+    return moved(X, np.linalg.inv(M) if back else M)
 
 
 def mean_chirality(comparisons: Mapping[str, xr.Dataset]) -> np.ndarray:

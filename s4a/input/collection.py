@@ -11,6 +11,7 @@ import xarray as xr
 from s4a.geometry.mesh import as_dataset
 from s4a.input import plausibility
 from s4a.input.clean import REPAIRS, check_arrays, clean
+from s4a.input.coordinates import CoordinateSystem, file_system, in_one_system, with_system
 from s4a.input.files import (
     LONGEST_NAME,
     Paths,
@@ -43,6 +44,8 @@ def read_shape(
     strict: bool = False,
     close_holes: bool = False,
     label: Label = None,
+    coordinate_system: str | None = None,
+    unit: str | None = None,
 ) -> xr.Dataset:
     """Read one mesh file and clean it.
 
@@ -55,11 +58,13 @@ def read_shape(
     label : int, list of int, or "all", optional
         Read the file as a label volume, and return the surface of this label, see
         :func:`s4a.input.labels.read_volume`.
+    coordinate_system, unit : str, optional
+        Used if the file does not say its own (:mod:`s4a.input.coordinates`).
 
     Returns
     -------
     Dataset
-        See :func:`s4a.clean`; with the attributes ``path``, ``format`` and, if the file has them,
+        See :func:`s4a.clean`; with the attributes ``path``, ``format`` and, if they are known,
         ``coordinate_system`` and ``unit``.
 
     Raises
@@ -88,6 +93,7 @@ def read_shape(
     name = os.fsencode(Path(path)).decode("utf-8", "replace")
     try:
         mesh = as_dataset(points, triangles, {"path": name, **attrs})
+        mesh = with_system(mesh, coordinate_system, unit)
         mesh = clean(mesh, components=components, strict=strict, close_holes=close_holes)
     except ValueError as error:
         raise ValueError(f"{shown(path)}: {error}") from error
@@ -115,6 +121,8 @@ def read_shapes(
     close_holes: bool = False,
     pattern: str | None = None,
     label: Label = None,
+    coordinate_system: str | None = None,
+    unit: str | None = None,
     compare: bool = True,
     intersections: bool = True,
 ) -> xr.DataTree:
@@ -131,6 +139,9 @@ def read_shapes(
         Use only files whose name matches, such as ``"*_brain"``.
     label : int, list of int, or "all", optional
         Read the files as label volumes, see :func:`read_labels`.
+    coordinate_system, unit : str, optional
+        Of files that do not say theirs.  Shapes are converted to the most frequent system; if that
+        is not possible, none is converted, and a remark says so.
     compare : bool
         Compare each shape with the others in unit, chirality, form and genus
         (:mod:`s4a.input.plausibility`).
@@ -173,27 +184,34 @@ def read_shapes(
     for name, value in {**given, "pattern": pattern}.items():
         check(name, value)
     options = {"components": components, "strict": strict, "close_holes": close_holes}
+    system = {"coordinate_system": coordinate_system, "unit": unit}
     label = check_label(label)
     volumes = label is not None
-    meshes, attrs = {}, {}
+    meshes: dict[str, xr.Dataset] = {}
+    attrs: dict[str, dict[Any, Any]] = {}
     for name, source in _sources(paths, pattern, volumes).items():
         try:
-            meshes[name] = _cleaned(source, label, **options)
-            attrs[name] = meshes[name].attrs
+            meshes[name] = _cleaned(source, label, options, system)
         except ValueError as error:
             path = str(source) if isinstance(source, str | Path) else ""
             attrs[name] = {"status": "excluded", "reason": str(error), "path": path}
     if not meshes:
         reasons = "; ".join(f"{name}: {values['reason']}" for name, values in attrs.items())
         raise ValueError(f"none of {len(attrs)} shapes can be used ({reasons})")
+    remarks = remarks_on_files(paths, pattern, volumes=volumes)
+    try:
+        meshes = in_one_system(meshes)
+    except ValueError as error:
+        remarks.append(str(error))
+    attrs |= {name: mesh.attrs for name, mesh in meshes.items()}
+    attrs = dict(sorted(attrs.items()))
     comparisons = {}
     if compare and len(meshes) > 1:
         comparisons = examine(meshes, intersections=intersections)
     used = {name: values for name, values in attrs.items() if values["status"] != "excluded"}
-    flags, remarks = plausibility.find_warnings(used, comparisons)
+    flags, on_shapes = plausibility.find_warnings(used, comparisons)
     nodes = {f"/original/{name}": mesh for name, mesh in meshes.items()}
-    remarks = [*remarks, *remarks_on_files(paths, pattern, volumes=volumes)]
-    nodes["/report"] = shape_report(attrs, flags, remarks, comparisons)
+    nodes["/report"] = shape_report(attrs, flags, [*on_shapes, *remarks], comparisons)
     return xr.DataTree.from_dict(nodes)
 
 
@@ -304,6 +322,8 @@ def shape_report(
     columns: dict[str, list[Any] | np.ndarray] = {
         key: [shown(row.get(key, "")) for row in rows] for key in TEXTS
     }
+    known = [CoordinateSystem() if r["status"] == "excluded" else file_system(r) for r in rows]
+    columns["coordinate_system"] = [str(system) for system in known]
     columns |= {key: np.array([row.get(key, -1) for row in rows], np.int64) for key in COUNTS}
     columns |= {key: [float(row.get(key, np.nan)) for row in rows] for key in _AREAS}
     report = dataset({"remarks": "\n".join(remarks)}, **columns)
@@ -332,10 +352,10 @@ def _sources(paths, pattern, volumes):
     return dict(sorted(paths.items()))
 
 
-def _cleaned(source, label, **options):
+def _cleaned(source, label, options, system):
     """Read and clean a file, a Dataset or a pair of arrays."""
     if isinstance(source, str | Path):
-        return read_shape(source, label=label, **options)
-    if isinstance(source, xr.Dataset):
-        return in_unit(clean(source, **options), source.attrs.get("unit"))
-    return clean(as_dataset(*check_arrays(*source)), **options)
+        return read_shape(source, label=label, **options, **system)
+    mesh = source if isinstance(source, xr.Dataset) else as_dataset(*check_arrays(*source))
+    mesh = with_system(mesh, **system)
+    return in_unit(clean(mesh, **options), mesh.attrs.get("unit"))

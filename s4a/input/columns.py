@@ -21,7 +21,6 @@ _CODES = {-1.0, *(float(s + n + d) for s in ("", "-") for d in "789" for n in ("
 _CODES |= {float(s + d * n) for s in ("", "-") for d in "789" for n in range(2, 7)}
 _CODES |= {float(s + n) for s in ("", "-") for n in ("9998", "9997", "32768", "2147483648")}
 _CODES |= {32767.0, 65535.0, 2147483647.0}
-_CERTAIN = 99  # codes of at least this size, if negative or of three digits, are never values
 _WORDS = re.compile(r"[?.]+|unknown|missing|not available|n\.a\.|n\.?d\.?|#.*[!?]", re.IGNORECASE)
 # level of an outlier in a column; of a usual code; of a value ten times the others
 _LEVEL, _CODE_LEVEL, _SLIP_LEVEL = 3e-4, 0.01, 0.04
@@ -119,7 +118,7 @@ def _report_codes(codes, cells, names, what, others):
         return
     numbers = [float(cells[i]) for i in np.flatnonzero(codes) if is_plain_number(cells[i])]
     others = f" ({others})" if others else ""
-    if any(x <= -_CERTAIN or x > _CERTAIN for x in numbers):
+    if any(x < -10 or x > 99 for x in numbers):  # others may be values
         raise ValueError(
             f"{what}: {found} is a code of a missing value{others}: write NA, or, if it is a "
             "value, give the column in another unit"
@@ -153,11 +152,13 @@ def missing_codes(x: np.ndarray) -> np.ndarray:
 def _is_code(code, rest, count):
     """Whether a usual code is one among the other values of its column."""
     n, decimals, extent = len(rest) + 1, (rest % 1 != 0).mean(), np.ptp(rest)
-    level = n * _p_value(code, rest)
+    level, levels = n * _p_value(code, rest), len(np.unique(rest))
+    if 2 * levels < n and rest.min() >= 0 and abs(code) > 2 * rest.max():
+        return True  # one of few levels
     if code < 0 <= rest.min():
         zero_is_far = rest.min() >= max(5, abs(code)) or level < _CODE_LEVEL
-        return code <= -_CERTAIN or zero_is_far or (n > 4 and code < -1 and decimals > 0.75)
-    if abs(code) > _CERTAIN and n > 5 and decimals == 1:
+        return code < -10 or zero_is_far or (n > 4 and code < -1 and decimals > 0.75)
+    if abs(code) > 99 and n > 5 and decimals == 1:
         return True  # the only integer
     if 0 < code < 10 and rest.min() < 0:
         return False
@@ -188,12 +189,13 @@ def outlying(x: np.ndarray) -> np.ndarray:
     found = np.zeros(len(x), bool)
     if len(x) < 5:
         return found
-    order = np.argsort(x, kind="stable")
-    for ends in (order, order[::-1]):
-        for k in range(max(1, min(len(x) // 10, 5)), 0, -1):
-            if _is_outlying(x[ends[-k]], x[ends[:-k]], len(x)):
-                found[ends[-k:]] = True
-                break
+    for sign in (1, -1):
+        # values of one end, up to a tenth of the column, or a third if they are equal
+        for value in np.unique(sign * x)[: -min(len(x) // 10, 5) - 2 : -1]:
+            end = sign * x >= value
+            most = len(x) / (3 if np.ptp(x[end]) == 0 else 10)
+            if end.sum() <= max(most, 1) and _is_outlying(sign * value, x[~end], len(x)):
+                found |= end
     return found
 
 

@@ -1,5 +1,6 @@
 """Mesh files: read and write triangle meshes, and find the files of a collection (5, the data)."""
 
+import contextlib
 import fnmatch
 import glob
 import hashlib
@@ -8,14 +9,15 @@ import re
 import unicodedata
 import zipfile
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from s4a.input.coordinates import CoordinateSystem, map_between, moved, system_in
 from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
-from s4a.input.labels import VOLUMES, volume_format
+from s4a.input.labels import VOLUMES, grid_of, volume_format
 from s4a.input.polygons import triangulated
 from s4a.input.raw import check_there, content, regular_file, shown
 
@@ -47,8 +49,8 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
         As in the file, including non-finite ones; for STL, the distinct corners.
     triangles : int32 ndarray (m, 3)
     attrs : dict of str
-        ``format``; ``coordinate_system`` (RAS or LPS) and ``unit`` if the file has them; ``note``
-        if the suffix is that of another format.
+        ``format``; ``coordinate_system`` and ``unit`` if the file has them
+        (:mod:`s4a.input.coordinates`); ``note`` if the suffix is that of another format.
 
     Raises
     ------
@@ -84,19 +86,33 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
         with np.errstate(all="ignore"):  # invalid numbers are an error here or cleaned later
             points, cells, attrs = FORMATS[name].read(data)
             points, triangles, n_crossing = _checked(points, cells)
+            attrs, notes = {"format": name, **attrs, **system_in(data, name).attrs}, []
     except Exception as error:  # no file may end the run over a collection
         why = shown(error) or type(error).__name__
         raise ValueError(f"{shown(path)} cannot be read as {name}: {why}") from error
-    attrs, notes = {"format": name, **attrs}, []
-    space = re.search(rb"SPACE=(RAS|LPS)", data[:1000])  # 3D Slicer writes this into any header
-    if space:
-        attrs["coordinate_system"] = space[1].decode()
     suffix = suffix_of(path)
     if suffix in SUFFIXES and suffix not in FORMATS[name].suffixes.split():
         notes.append(f"named {path.suffix} but read as {name} by its content; rename the file")
     if n_crossing:
         notes.append(f"{n_crossing} polygons intersect themselves; save the surface as triangles")
     return points, triangles, attrs | ({"note": "; ".join(notes)} if notes else {})
+
+
+def systems_of(shapes: Mapping[str, Any], given: CoordinateSystem) -> dict[str, CoordinateSystem]:
+    """Return the coordinate systems of files and meshes by name, without unreadable files.
+
+    `given` says what they leave open.
+    """
+    systems = {}
+    for name, shape in shapes.items():
+        if not isinstance(shape, str | os.PathLike):
+            systems[name] = CoordinateSystem.of(getattr(shape, "attrs", {})).filled(given)
+            continue
+        with contextlib.suppress(Exception):  # reading the shape will raise the error
+            data = content(Path(shape)).removeprefix(b"\xef\xbb\xbf")
+            own = grid_of(data)[2] if volume_format(data) else system_in(data, format_of(data))
+            systems[name] = own.filled(given)
+    return systems
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str:
@@ -156,6 +172,9 @@ def write_mesh(
     path: str | os.PathLike[str],
     points: np.ndarray,
     triangles: np.ndarray,
+    *,
+    coordinate_system: str = "",
+    unit: str = "",
     **vertex_scalars: np.ndarray,
 ) -> None:
     """Write a mesh file in the format of its suffix.
@@ -166,6 +185,9 @@ def write_mesh(
         Name ending in .ply (binary), .obj, .off, .stl, .vtk, .vtp, .gii or .npz.
     points : float ndarray (n, 3)
     triangles : int ndarray (m, 3)
+    coordinate_system, unit : str, optional
+        Written into the header, as 3D Slicer does, but for NPZ.  Coordinates in FreeSurfer's
+        surface RAS are converted to scanner RAS, and those of GIFTI to RAS and mm.
     **vertex_scalars : float ndarray (n,)
         Values per vertex by name, in PLY, VTK, VTP, GIFTI (float32) and NPZ.
 
@@ -205,7 +227,11 @@ def write_mesh(
         raise ValueError(
             f"{suffix} cannot hold values per vertex; write .ply, .vtk, .vtp, .gii or .npz"
         )
-    path.write_bytes(WRITERS[suffix](points, triangles, scalars))
+    system = CoordinateSystem.of({"coordinate_system": coordinate_system, "unit": unit})
+    written = system.in_world(*["RAS", "mm"] if suffix == ".gii" else [])
+    M = map_between(system, written, shown(path))
+    triangles = triangles[:, ::-1] if np.linalg.det(M) < 0 else triangles
+    path.write_bytes(WRITERS[suffix](moved(points, M), triangles, scalars, written.title))
 
 
 # the files of a collection

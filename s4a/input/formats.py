@@ -7,7 +7,7 @@ How to add a format:
    file is long enough for its counts (:func:`_need`, :mod:`s4a.input.raw`).
    :func:`s4a.input.files.read_mesh` checks shapes and indices and adds the name of the file;
    :func:`s4a.input.polygons.triangulated` converts polygons, ``(corners, sizes)``, to triangles.
-2. To write the format too, write ``_x_bytes(X, T, scalars)``.
+2. To write the format too, write ``_x_bytes(X, T, scalars, title)``.
 3. Add both to :data:`FORMATS` at the end of this file, with suffixes and signature.
 4. Add a valid file to ``seeds`` of ``tests/fuzz.py``, which damages it in thousands of ways.
 
@@ -27,6 +27,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
+from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -144,13 +145,13 @@ class _Legacy:
             n = int(width) * int(rows)
             if type_name.lower() != b"string":
                 self.values(n, type_name)
-            elif self.binary:
-                raise ValueError(
-                    "binary fields of strings before the points are not supported; "
-                    "save without them"
-                )
-            else:
-                for _ in range(min(n, len(self.data))):
+                continue
+            for _ in range(min(n, len(self.data))):
+                if self.binary:  # 2 bits: size of the length; the length; the string
+                    size = 8 >> (self.data[self.at : self.at + 1] or b"\0")[0] // 64
+                    length = int.from_bytes(self.data[self.at : self.at + size])
+                    self.at = min(self.at + size + length % 2 ** (8 * size - 2), len(self.data))
+                else:
                     self.line()
 
 
@@ -171,12 +172,12 @@ def _count_positions(values, n):
 
 
 def vtk_bytes(
-    X: np.ndarray, T: np.ndarray, scalars: dict[str, np.ndarray], title: str = "surface"
+    X: np.ndarray, T: np.ndarray, scalars: dict[str, np.ndarray], title: str = ""
 ) -> bytes:
     """Make a binary legacy file; 3D Slicer reads ``SPACE=RAS`` or ``SPACE=LPS`` in its title."""
     cells = np.column_stack([np.full(len(T), 3), T]).astype(">i4")
     parts = [
-        b"# vtk DataFile Version 3.0\n%b\nBINARY\nDATASET POLYDATA\n" % title.encode("ascii"),
+        b"# vtk DataFile Version 3.0\n%b\nBINARY\nDATASET POLYDATA\n" % (title or "S4A").encode(),
         b"POINTS %d double\n%b\n" % (len(X), X.astype(">f8").tobytes()),
         b"POLYGONS %d %d\n%b\n" % (len(T), cells.size, cells.tobytes()),
     ]
@@ -192,8 +193,10 @@ def vtk_bytes(
 # XML files
 
 
-def vtp_bytes(X: np.ndarray, T: np.ndarray, arrays: dict[str, np.ndarray]) -> bytes:
-    """Make an XML file with arrays in base64.
+def vtp_bytes(
+    X: np.ndarray, T: np.ndarray, arrays: dict[str, np.ndarray], title: str = ""
+) -> bytes:
+    """Make an XML file with arrays in base64, and `title` in a comment.
 
     Parameters
     ----------
@@ -210,10 +213,18 @@ def vtp_bytes(X: np.ndarray, T: np.ndarray, arrays: dict[str, np.ndarray]) -> by
     piece = f'<Piece NumberOfPoints="{len(X)}" NumberOfPolys="{len(T)}">'
     return (
         '<?xml version="1.0"?>\n<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" '
-        f'header_type="UInt64">\n<PolyData>\n{piece}\n<PointData>\n{fields}</PointData>\n'
+        f'header_type="UInt64">\n<PolyData>\n{_space_field(title)}{piece}\n<PointData>\n{fields}</PointData>\n'
         f"<Points>\n{_data_array('Points', X.astype('<f8'))}</Points>\n<Polys>\n{cells}</Polys>\n"
         "</Piece>\n</PolyData>\n</VTKFile>\n"
     ).encode()
+
+
+def _space_field(title):
+    """Field data with the axes in a title, as 3D Slicer reads them."""
+    space = re.search(r"SPACE=(\w+)", title)
+    codes = " ".join(str(ord(letter)) for letter in f"{space[1]}\0") if space else ""
+    array = '<Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">'
+    return f"<!-- {title} --><FieldData>\n{array}{codes}</Array>\n</FieldData>\n" if space else ""
 
 
 def _data_array(name, values):
@@ -229,7 +240,7 @@ def _data_array(name, values):
 
 def _parse_vtp(data):
     """Points, triangles and attributes of an XML file in any encoding, compressed or not."""
-    file = _Xml(data)
+    file = VtkXml(data)
     points, cells, n_before = [np.empty((0, 3))], [], 0
     for piece in file.root.iter("Piece"):
         X = file.values(piece.find("Points/DataArray")).reshape(-1, 3)
@@ -250,7 +261,7 @@ def _parse_vtp(data):
     return np.concatenate(points), joined(cells), {}
 
 
-class _Xml:
+class VtkXml:
     """An XML file, with the encoding of its arrays."""
 
     def __init__(self, data):
@@ -272,9 +283,12 @@ class _Xml:
         self.size_type = np.dtype(self.order + ("u8" if is_64_bit else "u4"))
         self.compressor = self.root.get("compressor")
 
-    def values(self, node):
+    def values(self, node: Element) -> np.ndarray:
         """Read the numbers of a DataArray."""
-        dtype, text = _number_type(node.get("type"), self.order), node.text or ""
+        return self._bytes(node, _number_type(node.get("type"), self.order))
+
+    def _bytes(self, node, dtype):
+        text = node.text or ""
         if node.get("format") == "ascii":
             return np.array(text.split(), dtype)
         if node.get("format") == "appended":
@@ -284,6 +298,16 @@ class _Xml:
             raw = self._unpack(text.strip().encode(), True)
         self.limit -= len(raw)  # many arrays may refer to the same bytes
         return np.frombuffer(raw, dtype)
+
+    def strings(self, name: str) -> list[str]:
+        """Strings of an array in the field data of the file, which are zero-terminated."""
+        nodes = [node for node in self.root.iter() if node.get("Name") == name]
+        return [
+            text.decode("latin-1")
+            for node in nodes
+            if node.get("type") == "String"
+            for text in self._bytes(node, np.dtype("u1")).tobytes().split(b"\0")
+        ]
 
     def _unpack(self, data, is_base64):
         """Bytes of one array: sizes come first, then the array or its compressed blocks."""
@@ -334,7 +358,6 @@ def _take(data, start, length, is_base64):
 
 # points, triangles (m, 3) or polygons, attributes
 Surface = tuple[np.ndarray, np.ndarray | Polygons, dict[str, str]]
-_BRAIN = {"coordinate_system": "RAS", "unit": "mm"}  # of GIFTI and FreeSurfer
 
 
 @dataclass(frozen=True)
@@ -351,7 +374,8 @@ class _Format:
     read : callable
         Function of bytes that returns a :data:`Surface`.
     write : callable, optional
-        Function of X ``(n, 3)``, T ``(m, 3)`` and a dict of values per vertex that returns bytes.
+        Function of X ``(n, 3)``, T ``(m, 3)``, a dict of values per vertex, and a title that may
+        have ``SPACE=RAS``, that returns bytes.
     scalars : bool
         The format can hold values per vertex.
     """
@@ -359,7 +383,7 @@ class _Format:
     suffixes: str
     signature: bytes
     read: Callable[[bytes], Surface]
-    write: Callable[[np.ndarray, np.ndarray, dict[str, Any]], bytes] | None = None
+    write: Callable[..., bytes] | None = None
     scalars: bool = False
 
 
@@ -712,7 +736,7 @@ def _read_mni(data):
     _need(m, len(ends), "polygons")
     found = polygons(corners, np.r_[0, ends])
     _need(len(found[0]), len(corners), "corners of polygons")
-    return points.reshape(-1, 3), found, _BRAIN
+    return points.reshape(-1, 3), found, {}
 
 
 # containers of arrays
@@ -769,21 +793,37 @@ def _read_gifti(data):
     arrays = gifti_arrays(data)
     points = [values for intent, values in arrays if intent == "POINTSET"]
     triangles = [values for intent, values in arrays if intent == "TRIANGLE"]
-    if not points or not triangles:
+    if len(points) != 1 or len(triangles) != 1:
         raise ValueError(
             "one set of points and one of triangles expected, "
-            f"found {len(points)} and {len(triangles)}"
+            f"found {len(points)} and {len(triangles)}: save each surface in a file of its own"
         )
-    return points[0], _integers(triangles[0]), _BRAIN
+    return points[0], _integers(triangles[0]), {}
+
+
+def freesurfer_counts(data: bytes) -> tuple[int, int, int]:
+    """Return the first byte after the counts, and the counts of vertices and triangles.
+
+    The comment before the counts ends with an empty line, or with one line end.
+    """
+    ends = [re.match(rb"[^\n]*\n(?:\r?\n)?", data), re.match(rb"(?s).*?\n\r?\n", data[:4096])]
+    n = m = -1
+    for end in filter(None, ends):
+        start = end.end() + 8
+        n, m = (int(k) for k in np.frombuffer(data[start - 8 : start].ljust(8, b"\0"), ">i4"))
+        if min(n, m) > 0 and 12 * (n + m) <= len(data) - start:
+            return start, n, m
+    if min(n, m) < 0:
+        raise ValueError("a comment and counts of vertices and triangles expected at the start")
+    _need(12 * (n + m), len(data) - start, "bytes of vertices and triangles")
+    return start, n, m
 
 
 def _read_freesurfer(data):
-    start = data.index(b"\n\n") + 2  # after two lines of comments
-    n, m = (int(k) for k in np.frombuffer(data, ">i4", 2, start))
-    _need(12 * (n + m), len(data) - start - 8, "bytes of vertices and triangles")
-    points = np.frombuffer(data, ">f4", 3 * n, start + 8).reshape(n, 3)
-    triangles = np.frombuffer(data, ">i4", 3 * m, start + 8 + 12 * n).reshape(m, 3)
-    return points, triangles, _BRAIN
+    start, n, m = freesurfer_counts(data)
+    points = np.frombuffer(data, ">f4", 3 * n, start).reshape(n, 3)
+    triangles = np.frombuffer(data, ">i4", 3 * m, start + 12 * n).reshape(m, 3)
+    return points, triangles, {}
 
 
 NPZ_KEYS = (
@@ -812,9 +852,10 @@ def _read_npz(data):
 # writers
 
 
-def _ply_bytes(X, T, scalars):
+def _ply_bytes(X, T, scalars, title=""):
     names = ["x", "y", "z", *(re.sub(r"\s", "_", name) for name in scalars)]
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(X)}\n"
+    comment = f"comment {title}\n" if title else ""
+    head = f"ply\nformat binary_little_endian 1.0\n{comment}element vertex {len(X)}\n"
     head += "".join(f"property float {name}\n" for name in names)
     head += f"element face {len(T)}\nproperty list uchar int vertex_indices\nend_header\n"
     vertex = np.column_stack([X, *scalars.values()]).astype("<f4")
@@ -823,26 +864,31 @@ def _ply_bytes(X, T, scalars):
     return head.encode() + vertex.tobytes() + face.tobytes()
 
 
-def _obj_bytes(X, T, _):
-    vertices = "".join("v {!r} {!r} {!r}\n".format(*x) for x in X.tolist())
+def _obj_bytes(X, T, _, title=""):
+    vertices = f"# {title}\n" * bool(title)
+    vertices += "".join("v {!r} {!r} {!r}\n".format(*x) for x in X.tolist())
     return (vertices + "".join("f {} {} {}\n".format(*t) for t in (T + 1).tolist())).encode()
 
 
-def _off_bytes(X, T, _):
+def _off_bytes(X, T, _, title=""):
     vertices = "".join("{!r} {!r} {!r}\n".format(*x) for x in X.tolist())
     faces = "".join("3 {} {} {}\n".format(*t) for t in T.tolist())
-    return f"OFF\n{len(X)} {len(T)} 0\n{vertices}{faces}".encode()
+    comment = f"# {title}\n" * bool(title)
+    return f"OFF\n{comment}{len(X)} {len(T)} 0\n{vertices}{faces}".encode()
 
 
-def _stl_bytes(X, T, _):
+def _stl_bytes(X, T, _, title=""):
     rows = np.zeros(len(T), _STL_TRIANGLE)
     rows["corner"] = X[T]
-    return b"binary".ljust(80) + len(T).to_bytes(4, "little") + rows.tobytes()
+    return f"binary {title}".encode().ljust(80) + len(T).to_bytes(4, "little") + rows.tobytes()
 
 
-def _gifti_bytes(X, T, scalars):
+def _gifti_bytes(X, T, scalars, title=""):
     from nibabel.gifti import gifti  # imported here only
 
+    space = gifti.GiftiCoordSystem(
+        *[2 if "SPACE=RAS" in title and "ORIGIN" not in title else 0] * 2
+    )
     arrays = [("POINTSET", X.astype(np.float32), {}), ("TRIANGLE", T, {})]
     for name, values in scalars.items():
         arrays.append(("SHAPE", values.astype(np.float32), {"Name": name}))
@@ -850,12 +896,12 @@ def _gifti_bytes(X, T, scalars):
     for intent, values, words in arrays:
         meta = gifti.GiftiMetaData(words)
         image.add_gifti_data_array(
-            gifti.GiftiDataArray(values, f"NIFTI_INTENT_{intent}", meta=meta)
+            gifti.GiftiDataArray(values, f"NIFTI_INTENT_{intent}", meta=meta, coordsys=space)
         )
     return image.to_bytes()
 
 
-def _npz_bytes(X, T, scalars):
+def _npz_bytes(X, T, scalars, title=""):
     out = io.BytesIO()
     np.savez_compressed(out, position=X, corner_vertex=T, **scalars)
     return out.getvalue()

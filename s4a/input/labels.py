@@ -15,6 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from s4a.geometry.mesh import directed_edges
+from s4a.input.coordinates import CoordinateSystem, nifti_system
 from s4a.input.raw import check_there, content, gunzip, reading
 from s4a.options import check_label
 
@@ -61,7 +62,7 @@ def read_volume(
     Returns
     -------
     points : float64 ndarray (n, 3)
-        In millimetres, RAS if the file has an orientation.
+        In millimetres, RAS if the file has an orientation (:mod:`s4a.input.coordinates`).
     triangles : int32 ndarray (m, 3)
         Counter-clockwise seen from outside.
     attrs : dict of str
@@ -83,7 +84,7 @@ def read_volume(
     points = points @ affine[:3, :3].T + affine[:3, 3]
     if np.linalg.det(affine[:3, :3]) < 0:
         triangles = triangles[:, ::-1]
-    attrs |= {"label": str(checked), "unit": "mm"}
+    attrs |= {"label": str(checked)}
     if at_border:
         closed = "the structure reaches the border of the volume, and was closed there"
         attrs["note"] = "; ".join(filter(None, [attrs.get("note"), closed]))
@@ -99,8 +100,10 @@ def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarra
     return _marked(values, check_label(label)), affine
 
 
-def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], np.ndarray]:
-    """Read the shape of a volume, of labels or grey values, and its affine map to mm, RAS.
+def read_grid(
+    path: str | os.PathLike[str],
+) -> tuple[tuple[int, ...], np.ndarray, CoordinateSystem]:
+    """Read the shape of a volume, of labels or grey values, its affine map, and its system.
 
     Raises
     ------
@@ -109,9 +112,17 @@ def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], np.ndarray
     """
     check_there(path)
     with reading(path, "a volume"):
-        kind, name = _kind_of(data := _as_nifti(content(Path(path), _UNPACKED)))
-        header = kind.header_class.from_fileobj(io.BytesIO(data))
-        return _shape_of(header), _affine_of(header, name)[0]
+        return grid_of(content(Path(path), _UNPACKED))
+
+
+def grid_of(data: bytes) -> tuple[tuple[int, ...], np.ndarray, CoordinateSystem]:
+    """Return shape, affine map and coordinate system of a volume; see :func:`read_grid`."""
+    kind, name = _kind_of(data := _as_nifti(data))
+    header = kind.header_class.from_fileobj(io.BytesIO(data))
+    affine, is_oriented = _affine_of(header, name)
+    codes = [0, 2] if name == "MGH" else [int(header[f"{form}form_code"]) for form in "qs"]
+    system = nifti_system(codes[1] or codes[0]) if is_oriented else CoordinateSystem(unit="mm")
+    return _shape_of(header), affine, system
 
 
 def _volume(data):
@@ -119,18 +130,21 @@ def _volume(data):
     found, data = volume_format(data), _as_nifti(data)
     kind, name = _kind_of(data)
     header = kind.header_class.from_fileobj(io.BytesIO(data))
-    shape = _shape_of(header)
+    shape, affine, system = grid_of(data)
     needed = int(np.prod(shape, dtype=object)) * header.get_data_dtype().itemsize
     n_bytes = 284 if name == "MGH" else 352
     if needed + n_bytes > len(data):
         raise ValueError(f"{needed} bytes of voxels {shape} expected, found {len(data) - n_bytes}")
     values, rounded = _whole(np.asanyarray(kind.from_bytes(data).dataobj).reshape(shape))
-    affine, is_oriented = _affine_of(header, name)
-    note = "the volume has no orientation, left and right may be exchanged"
-    frame = {"coordinate_system": "RAS"} if is_oriented else {"note": note}
-    if rounded:
-        frame["note"] = "; ".join(filter(None, [frame.get("note"), rounded]))
-    return values, affine, {"format": found} | frame
+    notes = (
+        [] if system.axes else ["the volume has no orientation, left and right may be exchanged"]
+    )
+    notes += [rounded] if rounded else []
+    return (
+        values,
+        affine,
+        {"format": found, **system.attrs} | ({"note": "; ".join(notes)} if notes else {}),
+    )
 
 
 def _whole(values):
@@ -190,7 +204,7 @@ def _as_nifti(data):
         origin = fields.get("space origin", "(0,0,0)").strip("()").split(",")
         affine = np.eye(4)
         affine[:3] = np.c_[axes.T, np.array(origin, float)] * np.array(signs)[:, None]
-        image.set_sform(affine, code="scanner")
+        image.set_sform(affine, code="aligned")
     else:
         spacings = np.array(fields.get("spacings", "1 1 1").split(), float)
         image.header.set_zooms(np.linalg.norm(axes, axis=1) if len(axes) else spacings)

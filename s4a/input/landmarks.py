@@ -1,6 +1,8 @@
 """Landmarks and curves on a surface (6.2, Fig. 7)."""
 
+import logging
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,16 +10,19 @@ import xarray as xr
 
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, edge_graph, edges, triangle_areas
-from s4a.input.annotations import RAS_TO_LPS, read_landmarks
+from s4a.input.annotations import read_landmarks
+from s4a.input.coordinates import CoordinateSystem, file_system, moved, transform
 from s4a.input.raw import shown
 from s4a.schema import check_type, dataset, require
+
+log = logging.getLogger(__name__)
 
 NAMED = ("landmark_name", "landmark_curve", "landmark_closed")
 ITERATIONS = 12  # halvings of a segment of a curve
 # share of sqrt(area): a landmark farther from its surface belongs to another mesh or frame
 FARTHEST_LANDMARK = 0.03
 # endings of landmark files named after shapes; longer ones first
-SUFFIXES = (".landmarks.csv", ".mrk.json", ".json", ".csv", ".pp")
+SUFFIXES = tuple(".landmarks.csv .mrk.json .json .fcsv .csv .tps .pts .pp".split())
 
 
 def as_landmarks(landmarks: xr.Dataset | Path | str) -> xr.Dataset:
@@ -35,13 +40,14 @@ def locate(
 ) -> xr.Dataset:
     """Project landmarks to the closest points of a surface.
 
-    Landmarks are converted between RAS and LPS if they and the mesh differ, or, if the mesh has no
-    coordinate system, if they lie on the surface only then.
+    Landmarks are converted to the coordinate system of the mesh if both are known.  Otherwise they
+    are taken as given or as in RAS, LPS or the file of the mesh, whatever fits, with a warning if
+    they are not taken as given.
 
     Parameters
     ----------
     landmarks : Dataset
-        ``landmark_name``, ``landmark_position`` in the unit of the mesh, see
+        ``landmark_name``, ``landmark_position``, see
         :func:`s4a.input.annotations.read_landmarks`.
     mesh : Dataset
     farthest : float
@@ -71,14 +77,21 @@ def locate(
             "landmarks need finite positions near the surface; "
             f"{str(landmarks['landmark_name'].values[i])!r} is at {P[i].tolist()}"
         )
-    system = landmarks.attrs.get("coordinate_system", "")
-    mesh_system = mesh.attrs.get("coordinate_system", "")
-    differ = system and mesh_system and system != mesh_system
-    surface_point, position, distance = _project(P * RAS_TO_LPS if differ else P, X, T)
-    if system and not mesh_system and distance.max() > limit:
-        converted = _project(P * RAS_TO_LPS, X, T)
-        if converted[2].max() < distance.max():
-            surface_point, position, distance = converted
+    maps = possible_maps(CoordinateSystem.of(landmarks.attrs), mesh)
+    found = {name: _project(moved(P, M), X, T) for name, M in maps.items()}
+    far = {name: projected[2].max() for name, projected in found.items()}
+    best = given = next(iter(found))
+    if far[given] > limit / 3:
+        best = min(far, key=lambda name: (far[name] > far[given] / 2, far[name]))
+    surface_point, position, distance = found[best]
+    limit = limit if best in (KNOWN, GIVEN) else limit / 3  # a guess needs more evidence
+    if best not in (KNOWN, GIVEN):
+        log.warning(
+            "the coordinate system of the landmarks or of the mesh is unknown: %s fits, with at "
+            "most %.3g from the surface; coordinate_system= says it",
+            best,
+            distance.max(),
+        )
     if distance.max() > limit:
         worst = int(distance.argmax())
         name = str(landmarks["landmark_name"].values[worst])
@@ -86,7 +99,9 @@ def locate(
             f"landmarks within {limit:.4g} of the surface needed "
             f"({100 * farthest:g} % of sqrt(area)); "
             f"{name!r} is {distance[worst]:.4g} away: is it of another mesh, unit "
-            "or coordinate system (RAS, LPS)?"
+            "or coordinate system (RAS, LPS)? Landmarks: "
+            f"{CoordinateSystem.of(landmarks.attrs)}; mesh: {CoordinateSystem.of(mesh.attrs)}; "
+            "coordinate_system= and unit= say what a file does not"
         )
     return _located(
         surface_point,
@@ -94,6 +109,36 @@ def locate(
         landmark_distance=distance,
         **{name: landmarks[name].values for name in NAMED if name in landmarks},
     )
+
+
+KNOWN, GIVEN = "the conversion", "the position as given"
+
+
+def possible_maps(landmarks: CoordinateSystem, mesh: xr.Dataset) -> dict[str, np.ndarray]:
+    """Return the maps (4, 4) that can take landmarks to a mesh, by what they assume.
+
+    There is one if both systems are known.  An unknown unit is that of the other.
+    """
+    system = CoordinateSystem.of(mesh.attrs)
+    known = transform(landmarks, system)
+    if known is not None and landmarks.axes:
+        return {KNOWN: known}
+    unit = landmarks.unit or system.unit
+    L, S = replace(landmarks, unit=unit), replace(system, unit=system.unit or unit)
+    if L.axes and S.axes:
+        found = {"a common origin": transform(L, S, origin=False)}
+    else:
+        found = {GIVEN: transform(CoordinateSystem(unit=L.unit), CoordinateSystem(unit=S.unit))}
+    guesses = {text: CoordinateSystem(text, "", unit) for text in ("RAS", "LPS")}
+    if S.axes and not L.axes:
+        guesses = {f"landmarks in {text}": (guess, S) for text, guess in guesses.items()}
+        guesses["the coordinates of the file"] = file_system(mesh.attrs), S
+    elif L.axes and not S.axes:
+        guesses = {f"a mesh in {text}": (L, guess) for text, guess in guesses.items()}
+    else:
+        guesses = {}
+    found |= {name: transform(*pair) for name, pair in guesses.items()}
+    return {name: M for name, M in found.items() if M is not None}
 
 
 def _project(P, X, T):

@@ -489,7 +489,6 @@ def _sizes(attrs, remarks):
             f"two groups of sizes, with the ratio {ratio:.3g}: {first_of(names[group], most=6)}, "
             "and the others; no size was changed: scale the files of one group if units differ"
         )
-    _different_units(attrs, remarks)
     if len(names) < 2:
         return
     far = np.abs(excess(values, SIZE)) if len(names) >= _ENOUGH else np.zeros(len(names))
@@ -525,16 +524,6 @@ def _two_sizes(values):
         # on a tie, the group of the first name stays
         group[low if (len(low), 0 in low) < (len(high), 0 in high) else high] = True
     return group
-
-
-def _different_units(attrs, remarks):
-    for key in ("unit", "coordinate_system"):
-        values = {name: shape[key] for name, shape in attrs.items() if shape.get(key)}
-        if len(set(values.values())) > 1:
-            remarks.append(
-                f"the files have different {key.replace('_', ' ')}s, and none was converted "
-                f"({_names_by(values)})"
-            )
 
 
 def _genus(attrs, remarks):

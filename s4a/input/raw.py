@@ -129,6 +129,24 @@ def shown(text: object) -> str:
     return "".join(escaped)
 
 
+def sentences(text: str, longest: int) -> str:
+    """Return the sentences of a text, from the first, that fit in so many characters; one at least.
+
+    A sentence ends with a full stop or a semicolon that is not in brackets.
+
+    Examples
+    --------
+    >>> from s4a.input.raw import sentences
+    >>> sentences("a is far (b; c); it was not moved. It is 3 mm away.", 35)
+    'a is far (b; c); it was not moved.'
+    >>> sentences("a is far (b; c); it was not moved", 9)
+    'a is far (b; c)'
+    """
+    ends = [end.start() + 1 for end in re.finditer(r"[.;](?= (?![^(]*\)))", text)] + [len(text)]
+    fitting = max([end for end in ends if end <= longest], default=ends[0])
+    return text[:fitting].removesuffix(";")
+
+
 def text_of(data: bytes) -> str:
     """Decode the text of a file in UTF-8, with or without a byte order mark.
 

@@ -398,9 +398,9 @@ def _resources(study, camera):
 def _parameters(study, camera):
     attrs = study["report"].attrs
     rows = [[name, str(value)] for name, value in kept_options(study).items()]
-    # the keys of the registered shapes are not parameters, and too long for a page
+    # the names and keys of files are not parameters, and too long for a page
     others = [[key, value] for key, value in attrs.items() if str(value)]
-    rows += [row for row in others if row[0] not in ("made_from", "options")]
+    rows += [row for row in others if row[0] not in ("file", "made_from", "options")]
     if not rows:
         return PARTS.missing(["parameters"])
     return PARTS.table(["parameter", "value"], rows, name="parameters")

@@ -45,6 +45,40 @@ def kind_of(name: str) -> str:
     return f"{stage}/shape" if shape and f"{stage}/shape" in HOLDS else stage
 
 
+def shape_of(name: str) -> str:
+    """Return the shape of a file, or the name itself if the file is of all shapes.
+
+    Examples
+    --------
+    >>> from s4a.study.contents import shape_of
+    >>> shape_of("network/comparison_brain_01"), shape_of("registration/a"), shape_of("pca")
+    ('brain_01', 'a', 'pca')
+    """
+    stage, _, shape = name.partition("/")
+    return shape.partition("_")[2] or shape if stage == "network" and shape else shape or name
+
+
+def check_name(name: str, data: xr.Dataset) -> None:
+    """Raise ValueError unless a file has the name under which it was written.
+
+    Examples
+    --------
+    >>> from s4a.schema import dataset
+    >>> from s4a.study.contents import check_name
+    >>> check_name("coarse/a", dataset({"file": "coarse/b"}))
+    Traceback (most recent call last):
+    ...
+    ValueError: it holds b, is named a: files were exchanged or renamed
+    """
+    stored = data.attrs.get("file")
+    if not isinstance(stored, str):
+        raise ValueError("it has no name of its own: another version of s4a wrote it")
+    if stored != name:
+        of_kind = kind_of(stored) == kind_of(name)
+        held, named = map(shape_of, (stored, name)) if of_kind else (stored, name)
+        raise ValueError(f"it holds {held}, is named {named}: files were exchanged or renamed")
+
+
 def check_contents(name: str, data: xr.Dataset) -> None:
     """Raise ValueError unless a file has the variables and attributes of its kind.
 

@@ -14,6 +14,7 @@ from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input import plausibility
 from s4a.input.chirality import AUTO, is_mirrored, mirror_image
 from s4a.input.collection import shape_report
+from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.files import SUFFIXES as MESHES
 from s4a.input.files import files_named, suffix_of
 from s4a.input.landmarks import SUFFIXES
@@ -59,6 +60,8 @@ def insert(
     *,
     landmarks: Path | str | None = None,
     reflect: str | list[str] | None = None,
+    coordinate_system: str | None = None,
+    unit: str | None = None,
     compare: bool = True,
     n_jobs: int | None = None,
 ) -> xr.DataTree:
@@ -82,6 +85,9 @@ def insert(
     reflect : str or list of str, optional
         Names of new shapes to mirror, separated by commas.  ``"auto"`` mirrors the shapes whose
         chirality is opposite to that of the study.  By default no shape is mirrored.
+    coordinate_system, unit : str, optional
+        Of files that do not say theirs; by default as in the options of the study.  New shapes are
+        converted to the system of the study.
     compare : bool
         Compare each new shape with the study in unit, chirality, form and genus, and warn about
         suspect ones in ``/report``.
@@ -106,8 +112,8 @@ def insert(
     Raises
     ------
     ValueError
-        If the study is not finished, no shape can be used, one has the name of the template, or
-        `reflect` names a shape that is not given.
+        If the study is not finished, no shape can be used, one has the name of the template,
+        `reflect` names a shape that is not given, or axes or unit are known of some shapes only.
 
     See Also
     --------
@@ -136,9 +142,16 @@ def insert(
     missing = [name for name in needed if name not in study.children]
     if missing:
         raise ValueError(f"a finished study is needed; this one lacks {', '.join(missing)}")
-    options = Options.from_report(study)
+    named = {"coordinate_system": coordinate_system, "unit": unit}
+    options = Options.from_report(study).changed({k: v for k, v in named.items() if v is not None})
     template = study["registration"].attrs["template"]
     meshes, attrs = read_new(shapes, options, landmarks)
+    system = with_system(
+        study["original"][template].to_dataset(), options.coordinate_system, options.unit
+    )
+    for name, mesh in meshes.items():
+        meshes[name] = in_axes(mesh, CoordinateSystem.of(system.attrs), name)
+        attrs[name] |= meshes[name].attrs
     if template in meshes:
         raise ValueError(f"new shapes need other names than the template, {template!r}; rename it")
     descriptors = descriptors_of(study) if compare or reflect == AUTO else {}

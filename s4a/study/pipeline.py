@@ -16,6 +16,7 @@ from joblib import effective_n_jobs, parallel_config
 
 from s4a.input.chirality import AUTO, mean_chirality, mirrored_shapes, to_reflect
 from s4a.input.collection import remarks_on_files
+from s4a.input.coordinates import CoordinateSystem
 from s4a.input.plausibility import Flags
 from s4a.input.subjects import read_table
 from s4a.method.network import choose_pairs, spectral_distance
@@ -24,7 +25,7 @@ from s4a.method.remesh import check_wrap
 from s4a.options import Options, given_options
 from s4a.schema import dataset
 from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
-from s4a.study.processes import temporary_folder
+from s4a.study.processes import limited, temporary_folder
 from s4a.study.quality_control import (
     check_plausibility,
     check_registrations,
@@ -35,12 +36,13 @@ from s4a.study.quality_control import (
     unflagged,
 )
 from s4a.study.report import write_report
-from s4a.study.runner import Keys, Run, Task
+from s4a.study.runner import Keys, Run, Task, names_and_keys
 from s4a.study.sources import (
     Collection,
     Marked,
     Sources,
     check_one_structure,
+    common_system,
     find_guides,
     find_sources,
     remarks_on_guides,
@@ -185,22 +187,29 @@ def analyse(
     subjects = None if settings.table is None else read_table(settings.table, list(sources))
     if subjects is not None:
         check_one_structure(subjects)
+    system, on_systems = common_system(sources, settings)
+    remarks += on_systems
     settings.check_against(list(sources))
     marked = find_guides(sources, settings.landmarks, settings.feature_names)
     with lock(store) as claim:
-        run = Run(claim, n_jobs)
+        run = Run(claim, limited(limited(n_jobs), len(sources)))
         if subjects is not None:
-            write(with_contents(subjects, sources), run.folder / "subjects.nc")
+            write(with_contents(subjects, sources), run.folder / "subjects.nc", name="subjects")
         else:
             remarks = remarks + remarks_on_table(run.folder / "subjects.nc", sources)
         remarks = remarks + remarks_on_guides(sources, marked, settings.feature_names)
         with run.report_unforeseen():
-            run_steps(run, sources, marked, settings, remarks)
+            run_steps(run, sources, marked, settings, remarks, system)
     return open_study(store)
 
 
 def run_steps(
-    run: Run, sources: Sources, marked: Marked, options: Options, remarks: list[str]
+    run: Run,
+    sources: Sources,
+    marked: Marked,
+    options: Options,
+    remarks: list[str],
+    system: CoordinateSystem | None,
 ) -> None:
     """Run all steps of the paper; each skips files that are done."""
     # dependencies of the files; a key contains those of all files before it:
@@ -210,8 +219,8 @@ def run_steps(
     #   network/descriptor_*, comparison_*    latent/* of excluded -> registration/* <- registration
     #                                                     |
     #                                                pca, report
-    reflected, on_chirality = choose_reflected(run, sources, marked, options)
-    original = read_and_clean(run, sources, marked, options, reflected)
+    reflected, on_chirality = choose_reflected(run, sources, marked, options, system)
+    original = read_and_clean(run, sources, marked, options, reflected, system)
     original, flags, on_shapes = check_plausibility(run, original, options)
     stop_if_flagged(flags, options)
     coarse = remesh(run, original, options)
@@ -230,13 +239,23 @@ def run_steps(
 
 
 def read_and_clean(
-    run: Run, sources: Sources, marked: Marked, options: Options, reflected: list[str]
+    run: Run,
+    sources: Sources,
+    marked: Marked,
+    options: Options,
+    reflected: list[str],
+    system: CoordinateSystem | None,
 ) -> Keys:
-    """Read and clean the shapes, add landmarks and fields, mirror some (5.1): ``/original``."""
+    """Read and clean the shapes, add landmarks and fields, mirror some (5.1): ``/original``.
+
+    If there is a `system`, axes and unit of all shapes are converted to it.
+    """
     cleaning = options.of("cleaning")
     todo = []
     for n, (source, content) in sources.items():
         also: dict[str, Any] = {"reflected": True} if n in reflected else {}
+        if system is not None:
+            also["system"] = system.attrs
         key = (content, cleaning, *also.values())
         if n in marked:
             also["guides"] = landmarks, features = marked[n]
@@ -249,7 +268,11 @@ def read_and_clean(
 
 
 def choose_reflected(
-    run: Run, sources: Sources, marked: Marked, options: Options
+    run: Run,
+    sources: Sources,
+    marked: Marked,
+    options: Options,
+    system: CoordinateSystem | None,
 ) -> tuple[list[str], list[str]]:
     """Choose the shapes to mirror; return their names, and remarks.
 
@@ -267,8 +290,9 @@ def choose_reflected(
     file = run.folder / CHOICE
     contents = [content for _, content in sources.values()]
     key = task_key(list(sources), contents, options.of("cleaning"), options.k, AUTO)
+    key = key if system is None else task_key(key, system.attrs)
     if not is_done(file, key):
-        original = read_and_clean(run, sources, marked, options, [])
+        original = read_and_clean(run, sources, marked, options, [], system)
         comparisons = comparisons_of(run, original, options) if len(original) > 1 else {}
         reflected, remarks = mirrored_shapes(comparisons)
         choice = dataset(
@@ -276,7 +300,7 @@ def choose_reflected(
             mean_chirality=mean_chirality(comparisons) if comparisons else np.zeros(0),
             reflected=np.array([name in reflected for name in comparisons], int),
         )
-        write(choice.assign_coords(shape=list(comparisons)), file, key)
+        write(choice.assign_coords(shape=list(comparisons)), file, key, name="network/chirality")
     choice = read(file)
     remarks = choice.attrs["remarks"].splitlines()
     for remark in remarks:
@@ -294,7 +318,14 @@ def remesh(run: Run, original: Keys, options: Options) -> Keys:
     if options.sampling != "normals":
         settings = (*settings, options.sampling)
     todo = [
-        Task(n, f"coarse/{n}.nc", remesh_shape, (run.folder, n, options), (key, settings), (key,))
+        Task(
+            n,
+            f"coarse/{n}.nc",
+            remesh_shape,
+            (run.folder, n, options),
+            (key, settings),
+            names_and_keys("original", {n: key}),
+        )
         for n, key in original.items()
     ]
     coarse = run.do("remesh and spectrum", todo)
@@ -397,7 +428,8 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
             else []
         )
         for node in [*iterations, "network", "latent"]:
-            write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, coarse.values())
+            made_from = names_and_keys("coarse", coarse)
+            write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, made_from, name=node)
     return key
 
 
@@ -431,7 +463,7 @@ def insert_excluded(
             insert_shape,
             (run.folder, n, options),
             (latent, excluded[n], key, settings),
-            (latent, excluded[n]),
+            (f"latent={latent}", f"coarse/{n}={excluded[n]}"),
         )
         for n, key in aligned.items()
     ]
@@ -447,20 +479,21 @@ def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Optio
     mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
     if inserted:
         mesh.attrs["excluded"] = " ".join(inserted)
-    write(mesh, run.folder / "registration.nc", template_key, [latent])
+    made_from = [f"latent={latent}"]
+    write(mesh, run.folder / "registration.nc", template_key, made_from, name="registration")
     todo = []
     for n, key in sorted(coarse.items()):
         if n in run.failures:
             continue
-        latent_key = (inserted[n],) if n in inserted else ()
+        of_latent = {n: inserted[n]} if n in inserted else {}
         todo.append(
             Task(
                 n,
                 f"registration/{n}.nc",
                 register_shape,
                 (run.folder, n, template, options),
-                (template_key, key, *latent_key),
-                (template_key, *latent_key),
+                (template_key, key, *of_latent.values()),
+                (f"registration={template_key}", *names_and_keys("latent", of_latent)),
             )
         )
     registered = run.do("registration", todo)
@@ -492,5 +525,6 @@ def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> str:
             log.warning("no modes: %s", error)
             (run.folder / "pca.nc").unlink(missing_ok=True)
             return str(error)
-        write(result, run.folder / "pca.nc", task_key(keys), keys)
+        made_from = names_and_keys("registration", registered)
+        write(result, run.folder / "pca.nc", task_key(keys), made_from, name="pca")
     return ""

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import logging
 import os
 import re
 import shutil
@@ -16,14 +17,39 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from joblib import Parallel
+from joblib import Parallel, cpu_count
 from joblib.parallel import LokyBackend, get_active_backend
 
 from s4a.geometry.compiled import psutil
 
+log = logging.getLogger(__name__)
+
 CAN_LOCK = find_spec("fcntl") is not None  # not on Windows
 PR_SET_PDEATHSIG, M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = 1, -1, -3  # of Linux and glibc
 TEMPORARY = "s4a-"  # prefix of the folder of a temporary study
+
+
+def limited(n_jobs: int | None, n_tasks: int | None = None) -> int | None:
+    """Limit the number of processes on this machine to its cores, or two, and to the tasks.
+
+    Fewer processes than asked for are reported if there are fewer cores.
+
+    Examples
+    --------
+    >>> from s4a.study.processes import limited
+    >>> limited(999, 1), limited(None)
+    (1, None)
+    """
+    backend, _ = get_active_backend()
+    asked = backend.effective_n_jobs(n_jobs) if isinstance(backend, LokyBackend) else 0
+    cores = cpu_count()
+    if n_tasks is None and asked > max(cores, 2):
+        log.warning(
+            "%d processes were asked for; this machine has %d cores, so %d are used",
+            *(asked, cores, max(cores, 2)),
+        )
+    most = min(max(cores, 2), max(n_tasks or asked, 1))
+    return most if asked > most else n_jobs
 
 
 def workers(n_jobs: int | None, **options: Any) -> Parallel:
@@ -32,7 +58,7 @@ def workers(n_jobs: int | None, **options: Any) -> Parallel:
     Parameters
     ----------
     n_jobs : int, optional
-        As in joblib.
+        As in joblib, but limited, see :func:`limited`.
     **options
         Options of :class:`joblib.Parallel`.
 
@@ -43,6 +69,7 @@ def workers(n_jobs: int | None, **options: Any) -> Parallel:
     >>> workers(1)(delayed(abs)(x) for x in (-1, 2))
     [1, 2]
     """
+    n_jobs = limited(n_jobs)
     backend, _ = get_active_backend()
     if isinstance(backend, LokyBackend) and backend.effective_n_jobs(n_jobs) > 1:
         at_once = threading.current_thread() is threading.main_thread()

@@ -12,7 +12,7 @@ from s4a.options import Options, with_options
 from s4a.schema import dataset
 from s4a.study.netcdf import arrays, attributes, read
 from s4a.study.quality_control import comparison_of
-from s4a.study.runner import Run
+from s4a.study.runner import Run, names_and_keys
 from s4a.study.sources import Sources
 from s4a.study.store import write
 
@@ -72,7 +72,8 @@ def write_report(
             f"\nthe template {template}, given by name, is flagged "
             f"({template_row['warning'].item()})"
         )
-    write(report, run.folder / "report.nc", made_from=registered.values())
+    made_from = names_and_keys("registration", registered)
+    write(report, run.folder / "report.nc", made_from=made_from, name="report")
 
 
 def shape_attrs(run: Run, name: str, source: str | xr.Dataset, options: Options) -> dict[str, Any]:

@@ -19,14 +19,29 @@ from joblib import delayed, effective_n_jobs
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
+from s4a.input.raw import sentences
 from s4a.study.netcdf import is_done
 from s4a.study.processes import died, interruption_kept, workers
 from s4a.study.progress import Notes, Stage
-from s4a.study.store import LOGS, Claim, open_without_following, task_key, write
+from s4a.study.store import LOCK, LOGS, Claim, open_without_following, task_key, write
 
 log = logging.getLogger(__name__)
 
 Keys = dict[str, str]  # name of a shape, or file of several -> key of the result
+
+
+def names_and_keys(stage: str, keys: Keys) -> tuple[str, ...]:
+    """Return names and keys of the files of shapes, for files that are made from them.
+
+    Examples
+    --------
+    >>> from s4a.study.runner import names_and_keys
+    >>> names_and_keys("coarse", {"a": "0c1d"})
+    ('coarse/a=0c1d',)
+    """
+    return tuple(f"{stage}/{name}={key}" for name, key in keys.items())
+
+
 LONGEST = len("insert flagged shapes: ")  # longest text before the progress bar
 
 
@@ -46,7 +61,7 @@ class Task:
     inputs : tuple
         Dependencies of the result: keys of other tasks, contents, parameters.
     made_from : tuple of str
-        Keys of files that :func:`s4a.open_study` needs to use this one.
+        Names and keys, ``name=key``, of files that :func:`s4a.open_study` needs to use this one.
 
     Examples
     --------
@@ -270,8 +285,15 @@ class Run:
             with interruption_kept() as self.interrupted:
                 yield
             self.notes.write("finished")
-        except (ValueError, OSError, StageError):
+        except (ValueError, OSError, StageError) as error:
             self.end_if_interrupted()  # the interrupt may be the cause
+            gone = getattr(error, "filename", "") if isinstance(error, FileNotFoundError) else ""
+            if gone or not (self.folder / LOCK).is_file():
+                gone = gone if (self.folder / LOCK).is_file() else self.folder
+                raise OSError(
+                    f"{gone} was removed or replaced during the run: start it again, and keep the "
+                    "folder of the study in its place until the run ends"
+                ) from error
             raise
         except Exception as error:
             self.end_if_interrupted()
@@ -296,7 +318,8 @@ def do_task(task: Task, claim: Claim) -> Outcome:
         try:
             with threadpool_limits(1):
                 data = task.function(*task.arguments)
-            write(data, claim.folder / task.file, task.key, task.made_from, claim)
+            name, path = task.file.removesuffix(".nc"), claim.folder / task.file
+            write(data, path, task.key, task.made_from, claim, name=name)
         except OSError:  # of the folder or the disk, not of the shape
             raise
         except (Exception, SystemExit) as error:  # any error stops this task only
@@ -318,7 +341,7 @@ def in_a_line(error: BaseException) -> str:
     'IndexError: too large'
     """
     text = " ".join(str(error).split())
-    return type(error).__name__ + (f": {text[:300]}" if text else "")
+    return type(error).__name__ + (f": {sentences(text, 300)}" if text else "")
 
 
 def note(file: Path, text: str) -> None:

@@ -9,11 +9,13 @@ import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
 from s4a.input.annotations import feature_files
-from s4a.input.files import check_names, files_named, find_meshes
+from s4a.input.coordinates import CoordinateSystem, common
+from s4a.input.files import check_names, files_named, find_meshes, systems_of
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import read_bytes, shown
 from s4a.input.subjects import is_missing, listed
 from s4a.method.shape import features_of
+from s4a.options import Options
 from s4a.schema import require
 from s4a.study.netcdf import read
 from s4a.study.store import task_key
@@ -99,6 +101,23 @@ def _source_of(name, mesh):
     mesh = mesh if isinstance(mesh, xr.Dataset) else as_dataset(*mesh)
     require(mesh, "position", "corner_vertex", what=f"shape {name}")
     return mesh, content_key(mesh)
+
+
+def common_system(sources: Sources, options: Options) -> tuple[CoordinateSystem | None, list[str]]:
+    """Return the system to convert all shapes to, None if they have one, and a remark.
+
+    Raises ValueError if some systems are known and others are not.
+    """
+    given = CoordinateSystem.of(vars(options))
+    systems = systems_of({name: mesh for name, (mesh, _) in sources.items()}, given)
+    target = common(systems)
+    others = {n: s for n, s in systems.items() if (s.axes, s.unit) != (target.axes, target.unit)}
+    if not others:
+        return None, []
+    names = [f"{name} ({system})" for name, system in others.items()]
+    return target, [
+        f"{len(others)} of {len(systems)} shapes were converted to {target}: {listed(names)}"
+    ]
 
 
 def content_of_file(path: Path | str) -> str:

@@ -93,6 +93,7 @@ def write(
     made_from: Iterable[str] = (),
     claim: Claim | None = None,
     compression: int = 0,
+    name: str = "",
 ) -> None:
     """Write a file atomically, under a temporary name that is then renamed.
 
@@ -103,19 +104,26 @@ def write(
     key : str
         See :func:`task_key`.
     made_from : iterable of str
-        Keys of the files that it was computed from; :func:`s4a.open_study` skips a file if one of
-        them is missing, as after an incomplete run with other options.
+        Names and keys, ``name=key``, of the files that it was computed from;
+        :func:`s4a.open_study` skips a file if one of them is missing, as after an incomplete run
+        with other options.
     claim : Claim, optional
         Write only if the claim is still valid.
     compression : int
         See :func:`s4a.study.netcdf.write_netcdf`.
+    name : str
+        Name of the file within a study, as ``coarse/brain_01``, which :func:`s4a.open_study`
+        compares with its path; by default the path's own.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     data = data.copy(deep=False)
-    data.attrs = data.attrs | {"task_key": key, "made_from": " ".join(made_from)}
+    name = name or (f"{path.parent.name}/" if path.parent.name in STAGES else "") + path.stem
+    data.attrs |= {"file": name, "task_key": key, "made_from": " ".join(made_from)}
     buffer = io.BytesIO()  # HDF5 crashes the process if the disk is full
     write_netcdf(data, buffer, compression)
+    if claim is not None:
+        claim.check()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:

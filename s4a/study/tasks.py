@@ -18,6 +18,7 @@ from s4a.input.annotations import labels_of_mesh, read_scalars, with_features
 from s4a.input.chirality import mirror_image
 from s4a.input.clean import check_range, clean
 from s4a.input.collection import read_shape
+from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.landmarks import guides_of, with_landmarks
 from s4a.method import steps
 from s4a.method.initial_map import alignment_residual, transform_onto
@@ -40,9 +41,9 @@ def clean_shape(
 ) -> xr.Dataset:
     """Read and clean a file, or clean a mesh in memory if necessary.
 
-    `also` may have ``guides``, files of landmarks and fields with the keys of their contents, and
-    ``reflected`` to mirror the shape.  Raises OSError if a file has changed since its key was
-    computed.
+    `also` may have ``guides``, files of landmarks and fields with the keys of their contents,
+    ``system``, attributes of the coordinate system to convert to, and ``reflected`` to mirror the
+    shape.  Raises OSError if a file has changed since its key was computed.
     """
     mesh = cleaned(source, content, cleaning)
     guides = also.get("guides", NO_GUIDES)
@@ -56,6 +57,8 @@ def clean_shape(
             fields[name] = read_scalars(file, name)
     if fields:
         mesh = with_features(mesh, fields)
+    if "system" in also:
+        mesh = in_axes(mesh, CoordinateSystem.of(also["system"]))
     return mirror_image(mesh) if "reflected" in also else mesh
 
 
@@ -74,12 +77,15 @@ def cleaned(source: str | xr.Dataset, content: str, cleaning: dict[str, Any]) ->
     if isinstance(source, str):
         with unchanged(source, content):
             return read_shape(source, **cleaning)
+    source = with_system(source, cleaning["coordinate_system"], cleaning["unit"])
     if "file_vertex" in source:
         check_range(*as_arrays(source))
         area = float(triangle_areas(*as_arrays(source)).sum())
         mesh = source.assign_attrs({"status": "ok", "reason": "", "area": area} | source.attrs)
     else:
-        mesh = clean(source, **{name: cleaning[name] for name in cleaning if name != "label"})
+        mesh = clean(
+            source, **{name: cleaning[name] for name in ("components", "strict", "close_holes")}
+        )
         mesh = guided(mesh, source)
     return in_unit(mesh, source.attrs.get("unit"))
 

@@ -10,7 +10,7 @@ import xarray as xr
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.options import kept_options
 from s4a.schema import INPUT, in_unit, unit_of, variable
-from s4a.study.contents import check_contents, check_fit
+from s4a.study.contents import check_contents, check_fit, check_name
 from s4a.study.netcdf import DamagedError, damage_named, open_file, read, read_tree, stacked
 from s4a.study.store import check_is_study, write
 
@@ -100,8 +100,8 @@ class Reader:
 
     def __init__(self, folder: Path, reported: set[str] | None = None):
         self.folder, self.reported = folder, reported
-        # keys of the files that were read; None if they are not checked
-        self.keys: set[str] | None = set()
+        # keys of the files that were read, by name; None if they are not checked
+        self.keys: dict[str, str] | None = {}
         self.files: dict[str, xr.Dataset] = {}
 
     def read(
@@ -144,20 +144,21 @@ class Reader:
             others["triangle"] = self.files["registration"].sizes["triangle"]
         data = open_with(path, others)
         with damage_named(path):
+            check_name(name, data)
             check_contents(name, data)
         fault = self.fault(data)
         if not fault:
             with damage_named(path):
                 check_fit(name, data, self.files)
             if self.keys is not None:
-                self.keys.add(data.attrs.get("task_key", ""))
+                self.keys[name] = data.attrs.get("task_key", "")
             self.files[name] = data
         return data, fault
 
     def fault(self, data: xr.Dataset) -> str:
         """Reason why a file is not part of the study, or ""."""
-        made_from = data.attrs.get("made_from", "").split()
-        if self.keys is not None and not self.keys.issuperset(made_from):
+        made_from = [source.split("=", 1) for source in data.attrs.get("made_from", "").split()]
+        if self.keys is not None and any(self.keys.get(name) != key for name, key in made_from):
             return "belongs to an earlier run and is skipped; run the analysis again"
         return ""
 
@@ -169,9 +170,9 @@ def open_study(folder: Path | str) -> xr.DataTree:
     shapes.  No file is kept open.  Stages that are not yet computed are absent.  Files that do not
     match the others in the folder are skipped with a warning.
 
-    Every file is verified by its checksums (:mod:`s4a.study.netcdf`) and against the schema
-    (:mod:`s4a.study.contents`).  Links in the folder, and references of HDF5 to other files, are
-    refused.
+    Every file is verified by its checksums (:mod:`s4a.study.netcdf`), its own name, and against the
+    schema (:mod:`s4a.study.contents`).  Links in the folder, and references of HDF5 to other files,
+    are refused.
 
     Parameters
     ----------

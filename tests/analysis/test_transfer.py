@@ -368,7 +368,8 @@ def test_every_landmark_file_gives_the_same_points(tmp_path):
         found = read_landmarks(tmp_path / name)
         assert found["landmark_name"].values.tolist() == ["a", "b"], name
         assert found["landmark_position"].values.tolist() == points, name
-        assert found.attrs["coordinate_system"] == ("LPS" if name == "a.mrk.json" else "")
+        slicer = {"coordinate_system": "LPS", "unit": "mm"}
+        assert found.attrs == (slicer if name == "a.mrk.json" else {})
     write_landmarks(tmp_path / "out.csv", found)
     assert (tmp_path / "out.csv").read_text().split() == [
         "name,x,y,z",

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from importlib.metadata import version
@@ -12,10 +13,11 @@ from small import FLAGS
 
 from s4a import Options, cli, synthetic, write_mesh
 from s4a.cli import Parser, tables
-from s4a.cli.commands import COMMANDS
+from s4a.cli.commands import COMMANDS, exit_code
 from s4a.extensions import extensions
 from s4a.geometry.mesh import as_arrays
 from s4a.options import DECLARED
+from s4a.schema import dataset
 from s4a.study.progress import STAGES
 
 
@@ -54,6 +56,18 @@ def test_run_again_does_nothing_again(ran, folder, capsys):
     assert cli.main(["run", str(folder), "--out", str(study), *FLAGS]) == 0
     assert (study / "latent.nc").stat().st_mtime_ns == before
     assert "4 ok" in capsys.readouterr().out
+
+
+def test_a_script_can_ask_for_an_exit_code_where_shapes_are_not_ok(ran, folder, tmp_path, capsys):
+    study = shutil.copytree(ran[0], tmp_path / "study")
+    (tmp_path / "empty.ply").touch()
+    command = ["run", str(folder), str(tmp_path / "empty.ply"), "--out", str(study), *FLAGS]
+    for fail_on, code in (("none", 0), ("excluded", 3), ("flagged", 3)):
+        assert cli.main([*command, "--fail-on", fail_on]) == code
+    assert cli.main(["run", *command[1:2], *command[3:], "--fail-on", "flagged"]) == 0
+    assert "1 excluded" in capsys.readouterr().out
+    report = dataset(status=["ok", "flagged"])
+    assert [exit_code(report, what, 1) for what in ("none", "excluded", "flagged")] == [1, 1, 3]
 
 
 def test_run_writes_a_line_for_each_stage_where_there_is_no_terminal(ran):
@@ -192,6 +206,9 @@ def test_a_flag_means_one_thing_in_all_commands():
                 found.setdefault(names[-1], {}).setdefault(kind, []).append(name)
 
         one.flags(add)
+    # the methods that `compare` compares have no fast preset
+    presets = {choices for _, choices, _ in found.pop("--preset")}
+    assert presets == {("paper", "fast"), ("paper",)}
     assert {flag: kinds for flag, kinds in found.items() if len(kinds) > 1} == {}
 
 

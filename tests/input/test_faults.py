@@ -228,15 +228,9 @@ def test_files_of_different_units_are_reported():
     meshes = {name: as_dataset(*mesh) for name, mesh in collection().items()}
     meshes["shape_0"].attrs |= {"unit": "mm", "coordinate_system": "RAS"}
     meshes["shape_1"].attrs |= {"unit": "m", "coordinate_system": "LPS"}
-    remarks = read_shapes(meshes)["report"].attrs["remarks"]
-    assert (
-        "the files have different units, and none was converted (m: shape_1; mm: shape_0)"
-        in remarks
-    )
-    assert (
-        "different coordinate systems, and none was converted (LPS: shape_1; RAS: shape_0)"
-        in remarks
-    )
+    report = read_shapes(meshes)["report"].to_dataset()
+    assert "needed, found RAS, mm: shape_0; LPS, m: shape_1; unknown: " in report.attrs["remarks"]
+    assert report["coordinate_system"].values[:3].tolist() == ["RAS, mm", "LPS, m", "unknown"]
 
 
 def test_of_two_mirror_images_none_is_the_right_one():

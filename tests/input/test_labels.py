@@ -304,7 +304,8 @@ def test_one_command_leads_from_volumes_to_modes_and_resumes_and_inserts(volumes
     study.close()
     s4a.write_mesh(tmp_path / "a mesh.ply", *mesh)  # meshes go into a study of volumes, too
     into = [str(out), str(tmp_path / "a mesh.ply"), "--out", str(tmp_path / "new")]
-    assert cli.main(["insert", *into]) == 0
+    assert cli.main(["insert", *into]) == 2  # a PLY file does not say its coordinate system
+    assert cli.main(["insert", *into, "--coordinate-system", "RAS", "--unit", "mm"]) == 0
     Y, S = mesh
     half = S[Y[S][:, :, 0].min(1) > Y[:, 0].mean() - 4]
     s4a.write_mesh(tmp_path / "half.ply", Y, half)

@@ -136,7 +136,7 @@ def test_vtk_is_read_as_text_with_quads_and_metadata(tmp_path):
     attrs = same_surface(
         file(tmp_path, "m.vtk", text), X, np.vstack([[[0, 3, 2], [0, 2, 1]], T[2:]])
     )
-    assert attrs == {"format": "VTK", "coordinate_system": "RAS"}
+    assert attrs == {"format": "VTK", "coordinate_system": "RAS", "unit": "mm"}
 
 
 def test_binary_vtk_5_is_read_with_offsets(tmp_path):
@@ -266,8 +266,11 @@ def test_every_encoding_of_a_format_gives_the_same_surface(tmp_path, name):
     for content in wholes(name):
         result, corners, attrs = read_mesh(file(tmp_path, f"m{SEEDS[name][0]}", content))
         np.testing.assert_allclose(result[corners], points[triangles], atol=1e-6)
-        brain = {"coordinate_system": "RAS", "unit": "mm"}
-        assert attrs == {"format": name} | (brain if name in ("GIFTI", "FreeSurfer", "MNI") else {})
+        system = {"GIFTI": "RAS, origin unknown", "FreeSurfer": "surface RAS", "MNI": "RAS"}.get(
+            name
+        )
+        known = {"coordinate_system": system, "unit": "mm"} if system else {}
+        assert attrs == {"format": name} | known
 
 
 @pytest.mark.parametrize(

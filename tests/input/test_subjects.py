@@ -281,7 +281,8 @@ def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
     from s4a import write_mesh
     from s4a.geometry.mesh import as_arrays
 
-    write_mesh(tmp_path / "brain_07.ply", *as_arrays(brains["brain_07"]))
+    mesh = brains["brain_07"]
+    write_mesh(tmp_path / "brain_07.ply", *as_arrays(mesh), coordinate_system="RAS", unit="mm")
     (tmp_path / "broken.ply").write_text("no mesh")
     command = [
         "insert",

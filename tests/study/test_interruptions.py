@@ -7,6 +7,7 @@ import contextlib
 import errno
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -476,6 +477,23 @@ if __name__ == "__main__":
     options |= {"template": "brain_01", "include_flagged": True}
     analyse(sys.argv[2:], store=sys.argv[1], **options)
 """
+
+
+def test_a_study_that_is_removed_during_a_run_is_named(files, tmp_path, monkeypatch):
+    folder, replace = tmp_path / "study", os.replace
+    for gone in ("coarse/brain_01.nc", ""):
+
+        def remove(temporary, path, gone=gone):
+            replace(temporary, path)
+            if Path(path).name == "alignment_brain_02.nc":
+                (shutil.rmtree if not gone else os.unlink)(folder / gone)
+
+        monkeypatch.setattr(os, "replace", remove)
+        named = (folder / gone).relative_to(tmp_path)
+        with pytest.raises(OSError, match=f"{named} was removed or replaced during the run"):
+            analyse(files, store=folder, intersections=False, **OPTIONS)
+        (folder / "network" / "alignment_brain_02.nc").unlink(missing_ok=True)
+    assert not folder.exists()
 
 
 def test_a_worker_of_a_run_that_is_over_writes_nothing(tmp_path):

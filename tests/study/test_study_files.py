@@ -14,6 +14,7 @@ from small import OPTIONS
 from s4a import analyse, cli, open_study, synthetic, verify
 from s4a.study import netcdf, store
 from s4a.study.progress import read_costs
+from s4a.study.tree import Reader
 
 SECRET = b"the diary of somebody else " * 40
 
@@ -423,6 +424,38 @@ def test_a_file_that_does_not_hold_what_it_should_is_named_with_what(folder, nam
 
 
 # ---- verify
+
+
+def test_files_exchanged_within_a_study_are_refused_by_name(folder):
+    kinds = ["original/", "coarse/", "registration/"]
+    kinds += [f"network/{kind}_" for kind in ("descriptor", "comparison", "alignment")]
+    for kind in kinds:
+        a, b = (folder / f"{kind}brain_0{i}.nc" for i in (1, 2))
+        a.rename(folder / "c")
+        b.rename(a)
+        (folder / "c").rename(b)
+        with pytest.raises(OSError, match="holds brain_02, is named brain_01"):
+            Reader(folder).open(f"{kind}brain_01", netcdf.open_file)
+    with pytest.raises(OSError, match="holds brain_02, is named brain_01"):
+        open_study(folder)
+    found = verify(folder)
+    assert (found["state"].values == "damaged").sum() == 2 * len(kinds)
+    assert (found["state"].values != "whole").sum() == 2 * len(kinds)
+
+
+def test_a_file_under_the_name_of_another_is_refused(folder):
+    shutil.copy(folder / "network.nc", folder / "latent.nc")
+    with pytest.raises(OSError, match="holds network, is named latent: files were exchanged"):
+        open_study(folder)
+
+
+def test_a_file_made_from_a_file_of_another_run_is_skipped(folder):
+    path = folder / "registration" / "brain_01.nc"
+    data = netcdf.read(path)
+    registration = netcdf.attributes(folder / "registration.nc")["task_key"]
+    assert data.attrs["made_from"] == f"registration={registration}"
+    store.write(data, path, data.attrs["task_key"], [f"latent={registration}"])
+    assert verify(folder)["state"].sel(file="registration/brain_01.nc").item() == "stale"
 
 
 def test_verify_prints_one_line_and_has_an_exit_code(folder, capsys):
