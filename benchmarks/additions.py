@@ -27,7 +27,6 @@ import numpy as np
 
 import s4a
 from s4a import synthetic
-from s4a.geometry.align import cloud, icp
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.remesh import silence
@@ -48,16 +47,9 @@ def closest_in_space(X, cell, Y, C):
     return closest_point(X, Y, C)
 
 
-def one_start(X, area, Y, area_y):
-    """ICP from the pose as given alone, centroids on each other."""
-    shift = area_y @ Y / area_y.sum() - area @ X / area.sum()
-    return icp(cloud(X, area), cloud(Y, area_y), np.eye(3), shift)
-
-
 # what is put in the place of ours, where there is no switch
 INSTEAD = {
     "U by closest points in space": {"s4a.method.remesh.closest_point_in_star": closest_in_space},
-    "ICP from one start": {"s4a.method.initial_map.align": one_start},
 }
 PAPER = PRESETS["paper"]
 DEFAULTS = PRESETS[None]
@@ -70,7 +62,8 @@ ON_THE_PAPER = {
     "n_samples": {"n_samples": DEFAULTS["n_samples"]},
     "dense_iterations": {name: DEFAULTS[name] for name in ("n_samples", "dense_iterations")},
     "articulated": {"refine": "elastic", "articulated": True},
-    "alignment": {"alignment": "fitted"},
+    "alignment": {"alignment": "search"},
+    "displacement_alignment": {"displacement_alignment": "fitted"},
     "area_weighted": {"area_weighted": True},
     "n_projected": {"n_projected": N_PROJECTED},
 }

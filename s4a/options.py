@@ -297,7 +297,8 @@ class Options:
         "describes the format.  Only ``reflect`` and the statistics use the table.  Without a "
         "table, the table of an earlier run is kept")
     landmarks: Path | str | None = reading(None,
-        "folder of landmark files, named as the shapes, that guide registration",
+        "folder of landmark files, named as the shapes, that guide alignment and elastic "
+        "registration",
         more="The formats are 3D Slicer (.mrk.json), CSV and MeshLab (.pp).  Shapes without a file "
         "have no landmarks.  Landmarks of two shapes are paired by name.  "
         ":func:`s4a.with_landmarks` adds landmarks to a mesh in memory")
@@ -342,6 +343,15 @@ class Options:
         of="low resolution", pair=True)
     n_pairs: int = network(500, "number of pairs in the network, each with maps in both directions",
         least=1, section="5.1", more="All pairs are used if there are fewer")
+    alignment: str = network("search",
+        "rigid alignment: the best of several results of ICP in position and normal (search), "
+        "plain ICP from the pose of the files (icp), or that pose, with centroids aligned (given)",
+        choices=("search", "icp", "given"), paper="icp", section="4.1, step 2",
+        instead="ICP from the pose of the files", see="method/alignment", of="initial maps",
+        pair=True,
+        more="The search starts at the principal axes, so its result does not depend on the pose "
+        "of the files.  A shape that fits others alike in two poses is flagged.  Landmarks replace "
+        "the search and the pose from which plain ICP starts.  Use 'given' for aligned data")
     init: str = network("dense",
         "initial maps from nearest neighbours of all vertices (dense), from 10 landmarks, or as "
         "in pyFM from wave kernels of the shapes and around these landmarks (wave_kernels)",
@@ -423,12 +433,12 @@ class Options:
         "transfer only: match pairs in both directions and average the results",
         paper=False, section="6.2", instead="a template registered to a shape",
         see="analysis/transfer", pair=True, more="It is an option of :func:`s4a.register_pairs`")
-    alignment: str = registration("fitted",
+    displacement_alignment: str = registration("fitted",
         "rigid alignment to the template before displacements are computed: best fit of the "
-        "registered surface (fitted), or ICP before the registration (icp)",
-        choices=("fitted", "icp"), paper="icp", section="eq. 8",
+        "registered surface (fitted), or the initial alignment (initial)",
+        choices=("fitted", "initial"), paper="initial", section="eq. 8",
         instead="after ICP (4.1, step 2)", see="method/deform", of="registration", pair=True,
-        more="With 'icp', eq. 8 holds as printed in the paper")
+        more="With 'initial', eq. 8 holds as printed in the paper")
     area_weighted: bool = registration(True,
         "weight vertices by area when displacements are projected onto U Phi", paper=False,
         section="after eq. 8", instead="$(U \\phi)^\\dagger$ as printed", see="method/deform",
@@ -485,8 +495,6 @@ class Options:
                 "features= are fields on the vertices of meshes, and label= extracts meshes from "
                 "volumes, whose vertices are not known before"
             )
-        elif self.landmarks is not None and self.refine != "elastic":
-            why = f"landmarks guide elastic iterations, and refine={self.refine!r} has none"
         elif self.method == "scalable" and without:
             why = (
                 f"method='scalable' has no coarse mesh, and {without[0]}=True "

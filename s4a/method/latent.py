@@ -16,7 +16,8 @@ from scipy.sparse.csgraph import breadth_first_order
 from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import RigidTransform, realign
+from s4a.geometry.align import RigidTransform
+from s4a.method.alignment import pair_transform
 from s4a.method.fmap import fmap_from_match, orthogonality_error
 from s4a.method.initial_map import initial_map
 from s4a.method.median import area_differences, conformal_differences, distance_to_identity
@@ -630,6 +631,7 @@ def out_of_sample_basis(
     k_init: int = 20,
     step: int = 5,
     n_samples: int = N_SAMPLES,
+    alignment: str = "search",
     **options: Any,
 ) -> Array:
     """Compute the latent basis of an out-of-sample shape; the bases of the others stay fixed.
@@ -643,7 +645,7 @@ def out_of_sample_basis(
         Latent bases of the others.
     transforms : list of tuple (R, t)
         Approximate rigid transforms of the new shape onto each of the others.
-    k_init, step, n_samples : see :func:`s4a.analyse`
+    k_init, step, n_samples, alignment : see :func:`s4a.analyse`
     **options
         Options of :func:`s4a.method.initial_map.initial_map`.
 
@@ -653,7 +655,7 @@ def out_of_sample_basis(
     """
     maps = []
     for other, transform in zip(others, transforms, strict=True):
-        R, t = realign(new.cloud, other.cloud, transform)
+        R, t = pair_transform(new, other, transform, alignment)
         back = R.T, -R.T @ t
         maps.append(initial_map(other, new, back, k_init=k_init, n_samples=n_samples, **options).C)
     return _zoomout_of_new(new, others, Y, maps, step=step, n_samples=n_samples)

@@ -17,8 +17,9 @@ from joblib import effective_n_jobs, parallel_config
 from s4a.input.chirality import AUTO, mean_chirality, mirrored_shapes, to_reflect
 from s4a.input.collection import remarks_on_files
 from s4a.input.coordinates import CoordinateSystem
-from s4a.input.plausibility import Flags
+from s4a.input.plausibility import POSE, Flags
 from s4a.input.subjects import read_table
+from s4a.method.alignment import N_VOTERS
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca_without
 from s4a.method.remesh import check_wrap
@@ -31,7 +32,9 @@ from s4a.study.quality_control import (
     check_registrations,
     check_usable,
     comparisons_of,
+    exclude_ambiguous,
     exclude_flagged,
+    flag_poses,
     stop_if_flagged,
     unflagged,
 )
@@ -52,6 +55,7 @@ from s4a.study.sources import (
 from s4a.study.store import lock, task_key, write
 from s4a.study.tasks import (
     align_shape,
+    align_voters,
     clean_shape,
     consistent_maps,
     insert_shape,
@@ -226,16 +230,20 @@ def run_steps(
     coarse = remesh(run, original, options)
     flags, coarse, excluded, on_exclusion = exclude_flagged(run, coarse, flags, options)
     coarse, reference, aligned = align(run, coarse, options)
+    flags, coarse, ambiguous, on_poses = exclude_ambiguous(run, coarse, flags, options)
+    stop_if_flagged(flags, options)
     initial = initial_maps(run, coarse, aligned, options)
     latent = consistent_zoomout(run, coarse, initial, options)
-    inserted = insert_excluded(run, excluded, reference, latent, options)
-    registered = register(run, coarse | excluded, inserted, latent, options)
+    moved = align_excluded(run, excluded, reference, options)
+    flags = flag_poses(run, excluded, flags)
+    inserted = insert_excluded(run, moved | ambiguous, excluded | ambiguous, latent, options)
+    registered = register(run, coarse | excluded | ambiguous, inserted, latent, options)
     failed, on_registrations = check_registrations(run, registered, inserted)
     flags = {name: [*flags.get(name, []), *failed.get(name, [])] for name in registered}
     flags = unflagged(flags) if options.quality_control == "off" else flags
-    why_no_modes = modes(run, registered, flags, options)
-    remarks = [*on_chirality, *on_exclusion, *on_shapes, *on_registrations, *remarks]
-    write_report(run, sources, options, remarks, why_no_modes, registered, flags)
+    why_no_modes = modes(run, registered, flags, options, bool(on_poses))
+    remarks = [*on_chirality, *on_exclusion, *on_poses, *on_shapes, *on_registrations, *remarks]
+    write_report(run, sources, options, remarks, why_no_modes, registered, flags, bool(on_poses))
 
 
 def read_and_clean(
@@ -355,9 +363,19 @@ def align(run: Run, coarse: Keys, options: Options) -> tuple[Keys, tuple[str, st
     names = list(coarse)
     spectra = lowest_eigenvalues(run, coarse, options.k_init)
     reference = names[int(np.argmin(spectral_distance(spectra).sum(1)))]
-    aligned = task_key(list(coarse.values()), names, reference)
+    aligned = task_key(list(coarse.values()), names, reference, options.alignment)
+    voting = [reference, *(name for name in names if name != reference)][: N_VOTERS + 2]
+    settings = (run.folder, voting, reference, options.alignment)
+    task = Task("voters", "network/voters.nc", align_voters, settings, (aligned,))
+    run.do("align", [task], each=False)
     todo = [
-        Task(n, f"network/alignment_{n}.nc", align_shape, (run.folder, n, reference), (aligned, n))
+        Task(
+            n,
+            f"network/alignment_{n}.nc",
+            align_shape,
+            (run.folder, n, reference, options.alignment),
+            (aligned, n),
+        )
         for n in names
     ]
     moved = {name: coarse[name] for name in run.do("align", todo)}
@@ -433,13 +451,8 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
     return key
 
 
-def insert_excluded(
-    run: Run, excluded: Keys, reference: tuple[str, str], latent: str, options: Options
-) -> Keys:
-    """Insert the shapes that are excluded from the network (eq. 3): ``/latent/<shape>``.
-
-    Each shape is aligned to the reference and mapped to some shapes of the network; its latent
-    basis is solved for with their bases fixed.
+def align_excluded(run: Run, excluded: Keys, reference: tuple[str, str], options: Options) -> Keys:
+    """Align the shapes that are excluded from the network to the reference.
 
     Parameters
     ----------
@@ -450,11 +463,28 @@ def insert_excluded(
     name, reference_key = reference
     todo = [
         Task(
-            n, f"network/alignment_{n}.nc", align_shape, (run.folder, n, name), (reference_key, key)
+            n,
+            f"network/alignment_{n}.nc",
+            align_shape,
+            (run.folder, n, name, options.alignment),
+            (reference_key, key, options.alignment),
         )
         for n, key in excluded.items()
     ]
-    aligned = run.do("align flagged shapes", todo) if excluded else {}
+    return run.do("align flagged shapes", todo) if excluded else {}
+
+
+def insert_excluded(run: Run, aligned: Keys, excluded: Keys, latent: str, options: Options) -> Keys:
+    """Insert the shapes that are excluded from the network (eq. 3): ``/latent/<shape>``.
+
+    Each shape is mapped to some shapes of the network; its latent basis is solved for with their
+    bases fixed.
+
+    Parameters
+    ----------
+    aligned, excluded : dict of str to str
+        Keys of the alignments and of the low-resolution meshes.
+    """
     settings = (options.k_init, options.of("initial maps"), options.step, options.norm)
     todo = [
         Task(
@@ -474,7 +504,8 @@ def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Optio
     """Register every shape to the template, the median shape by default (4.2, eq. 6 to 8)."""
     template = options.template or attributes(run.folder / "latent.nc")["median"]
     projection = (options.area_weighted, options.n_projected)
-    settings = (template, options.dense_match, options.of("registration"), projection)
+    registration = {"alignment": options.alignment, **options.of("registration")}
+    settings = (template, options.dense_match, registration, projection)
     template_key = task_key(latent, settings)
     mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
     if inserted:
@@ -501,10 +532,13 @@ def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Optio
     return registered
 
 
-def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> str:
+def modes(
+    run: Run, registered: Keys, flags: Flags, options: Options, ambiguous: bool = False
+) -> str:
     """Compute the modes of variation (6.1), ``/pca``; return the reason if there are none.
 
-    Flagged shapes are excluded; their scores are computed along the modes of the others.
+    Flagged shapes are excluded; their scores are computed along the modes of the others.  With
+    `ambiguous`, shapes whose pose alone is ambiguous are included.
     """
     with run.stage("modes"):
         mesh = read(run.folder / "registration.nc")
@@ -514,7 +548,8 @@ def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> str:
         excluded = [
             name
             for name in registered
-            if name != template and any(flag.flagged for flag in flags[name])
+            if name != template
+            and any(flag.flagged and not (ambiguous and flag.kind == POSE) for flag in flags[name])
         ]
         excluded = [] if options.include_flagged else excluded
         coarse = read(run.folder / f"coarse/{template}.nc")
