@@ -24,9 +24,11 @@ from unittest import mock
 
 import differences
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import s4a
 from s4a import synthetic
+from s4a.geometry.align import rigid_transform
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.remesh import silence
@@ -78,6 +80,7 @@ READINGS = [
     ("weights", "linear_program"),
     ("n_latent", 90),
     ("step", 10),
+    ("alignment", "given"),
 ]
 NORMS = ("h2", "h1", "frobenius", "h2_image", "h2_both")
 OF_A_PAIR = ("refine", "init", "initial_refinement", "full_resolution_iterations", "bidirectional")
@@ -218,6 +221,40 @@ def errors(study, image):
     return 100 * np.mean(found, axis=0) / size
 
 
+def field_errors(study, image):
+    """Errors of rotation (degrees), displacement (% of sqrt(area)) and modes (mean |cos|).
+
+    The true displacement is that after the best rigid transform of the true positions.  Of each of
+    the first three principal components of true displacements, |cos| with the most similar of the
+    first three modes is taken.
+    """
+    registration = study["registration"].to_dataset()
+    template, X = registration.attrs["template"], registration["position"].values
+    area = registration["vertex_area"].values
+    others = [name for name in registration["shape"].values.tolist() if name != template]
+    angles, true, found = [], [np.zeros_like(X)], [np.zeros_like(X)]
+    for name in others:
+        one = registration.sel(shape=name)
+        Y = np.asarray(image(name, template))
+        R, t, _ = rigid_transform(Y, X, area)
+        off = Rotation.from_matrix(R @ one["icp_rotation"].values.T)
+        angles.append(np.rad2deg(off.magnitude()))
+        true.append(Y @ R.T + t - X)
+        found.append(one["displacement"].values)
+    distance = np.linalg.norm(np.subtract(found, true)[1:], axis=2).mean()
+    first, second = (_components(fields, area) for fields in (true, found))
+    cosine = np.abs(first @ second.T).max(1).mean()
+    return np.mean(angles), 100 * distance / np.sqrt(area.sum()), cosine
+
+
+def _components(fields, area):
+    """The first three principal components of fields (n, v, 3), orthonormal rows."""
+    rows = (np.subtract(fields, np.mean(fields, axis=0)) * np.sqrt(area)[:, None]).reshape(
+        len(fields), -1
+    )
+    return np.linalg.svd(rows, full_matrices=False)[2][:3]
+
+
 def carried_error(study, image):
     """Mean error of vertices of the template that are transferred, both ways where there are."""
     registration = study["registration"].to_dataset()
@@ -256,7 +293,9 @@ def measure(row, options, meshes, image, folder):
         carried = ""
     match, surface = errors(study, image)
     template = study["registration"].attrs["template"]
-    return [f"{match:.3f}", f"{surface:.3f}", carried, f"{seconds:.1f}", template]
+    rotation, displacement, cosine = field_errors(study, image)
+    fields = [f"{rotation:.2f}", f"{displacement:.3f}", f"{cosine:.2f}"]
+    return [f"{match:.3f}", f"{surface:.3f}", carried, f"{seconds:.1f}", template, *fields]
 
 
 def main():

@@ -18,6 +18,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 RESULTS = DOCS / "differences.csv"
 PAGE = DOCS / "differences.md"
 HEAD = ["set", "row", "matched", "surface", "carried", "seconds", "template"]
+HEAD += ["rotation", "displacement", "modes"]
 SETS = ("brains", "faces", "bodies")
 SWITCH = ["equation", "in the paper", "in S4A", "where", "option: default, in the paper"]
 LACKING = "not yet"  # instead of a figure that was not measured
@@ -110,11 +111,10 @@ READINGS = [
     Reading(
         "4.1, step 2",
         "ICP",
-        "point to point, in both directions, trimmed by a tenth of the pairs, from several "
-        "initial rotations (the given pose, alignments of the principal axes, tilted ones); to a "
-        "reference first, then again for each pair",
-        "ICP from the given pose only (no option)",
-        ("ICP from one start",),
+        'with `preset="paper"` plain ICP: each vertex of the source and the nearest of the target, '
+        "from the given pose with centroids aligned, for each pair",
+        '`alignment="given"`: no ICP; or `alignment="search"`, an addition',
+        ("alignment=given",),
     ),
     Reading(
         "4.1, step 4",
@@ -232,9 +232,14 @@ settings are as in 5.1. All shapes are registered to the first.
 **Error.** The error is the mean distance between the image of a template vertex and its true
 position, over vertices and shapes, in % of the square root of the area. There are two images: the
 *matched* vertex of the shape (eq. 4, 7), which cannot be more accurate than the vertex spacing, and
-the registered *surface*, template + displacement (eq. 8 and the line after it). CPU seconds are of
-the whole analysis, in one run while another program was running. Differences of less than a fifth
-have no meaning.
+the registered *surface*, template + displacement (eq. 8 and the line after it). These two do not
+depend on the rigid transformation. Therefore three more figures are given: the mean angle in
+degrees between the rotation of the initial alignment and the best one for the true positions; the
+mean distance, in % of the square root of the area, between the displacement and the true one after
+the best rigid transformation; and the mean |cos| between each of the first three principal
+components of the true displacements and the most similar of the first three modes. CPU seconds are
+of the whole analysis, in one run while another program was running. Differences of less than a
+fifth have no meaning.
 
 `python benchmarks/additions.py --write` measures everything into `docs/differences.csv` and
 writes this page; `python benchmarks/differences.py --write` writes the page only.
@@ -336,7 +341,8 @@ def results():
     if not RESULTS.is_file():
         return {}
     with RESULTS.open(encoding="utf-8", newline="") as file:
-        return {(line["set"], line["row"]): line for line in csv.DictReader(file)}
+        lines = (dict.fromkeys(HEAD, "") | line for line in csv.DictReader(file))
+        return {(line["set"], line["row"]): line for line in lines}
 
 
 def keep(which, row, cells):
@@ -382,12 +388,15 @@ def measured(found, rows, columns=("matched", "surface", "seconds")):
 
 def errors_of(found, rows):
     """Return the same table with both errors in one cell."""
-    head = ["", *(f"{which}{what}" for which in SETS for what in ("", ", CPU s"))]
+    whats = ("", ": rotation, displacement, modes", ", CPU s")
+    head = ["", *(f"{which}{what}" for which in SETS for what in whats)]
     cells = []
     for row, name in rows.items():
         line = [name]
         for which in SETS:
-            line += [both_errors(found, which, row), figure(found, which, row, "seconds")]
+            fields = [figure(found, which, row, column) for column in HEAD[-3:]]
+            fields = ", ".join(fields) if all(fields) else LACKING
+            line += [both_errors(found, which, row), fields, figure(found, which, row, "seconds")]
         cells.append(line)
     return table(head, cells)
 

@@ -16,6 +16,7 @@ from s4a.extensions import extensions
 
 Array = np.ndarray  # of numbers; its dims and kind stand in the docstring
 INPUT = "unit of the input"
+POSE = "pose"  # the kind of a flag for an ambiguous pose
 INPUT2 = "squared unit of the input"
 FIELD_UNIT = "unit of the field"
 ONE = "1"

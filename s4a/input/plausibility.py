@@ -413,9 +413,6 @@ KINDS = {
 _MUCH_MORE_OF = {"intersections": ("intersecting", _CROSSING), "spacing": ("lattice", _LATTICE)}
 
 
-POSE = "pose"  # the kind of a flag for an ambiguous pose
-
-
 class Flag(NamedTuple):
     """Finding about a shape: a key of :data:`KINDS`, the message, whether it flags the shape."""
 

@@ -33,8 +33,9 @@ from s4a.options import check
 
 N_VOTERS = 6
 # of sqrt(area): poses fit alike if the root of the difference of their mean squared residuals is
-# below it.  The shapes of a collection differ from each other by about 0.04
-ALIKE = 0.025
+# below it; the shapes of a collection differ from each other by about 0.04.  With fewer vertices
+# than ENOUGH their spacing hides part of the difference
+ALIKE, ENOUGH = 0.023, 500
 _COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
 IDENTITY = np.eye(3), np.zeros(3)
 
@@ -172,7 +173,8 @@ def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Ali
         ends = icp_each(source.cloud, other.cloud, starts, tolerance=5 * ROUGH)
         squared += np.array([residual for *_, residual in ends]) ** 2 / len(voters)
     order = np.argsort(squared, kind="stable")
-    best, alike = order[0], squared[order] - squared.min() < ALIKE**2
+    limit = ALIKE**2 * min(1.0, len(source.X) / ENOUGH)
+    best, alike = order[0], squared[order] - squared.min() < limit
     R, t = found[best]
     fits = tuple(np.sqrt(squared[order[alike]]).tolist())
     if len(fits) < 2 or _differs(source, voters, (R, t)):

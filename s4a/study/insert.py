@@ -18,7 +18,7 @@ from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.files import SUFFIXES as MESHES
 from s4a.input.files import files_named, suffix_of
 from s4a.input.landmarks import SUFFIXES
-from s4a.input.plausibility import POSE, Flag, Flags, find_warnings
+from s4a.input.plausibility import Flag, Flags, find_warnings
 from s4a.input.subjects import listed
 from s4a.method.alignment import N_VOTERS, align_onto, less_confident
 from s4a.method.latent import out_of_sample_latent
@@ -28,7 +28,7 @@ from s4a.method.register import from_latent
 from s4a.method.shape import Shape
 from s4a.method.steps import Study, basis_in, latent_bases, out_of_sample_basis_in
 from s4a.options import Options, with_options
-from s4a.schema import check_type, dataset, in_unit, require, unit_of, variable
+from s4a.schema import POSE, check_type, dataset, in_unit, require, unit_of, variable
 from s4a.study.processes import workers
 from s4a.study.sources import find_sources, guides_of_shape
 from s4a.study.tasks import clean_shape

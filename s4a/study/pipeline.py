@@ -17,14 +17,14 @@ from joblib import effective_n_jobs, parallel_config
 from s4a.input.chirality import AUTO, mean_chirality, mirrored_shapes, to_reflect
 from s4a.input.collection import remarks_on_files
 from s4a.input.coordinates import CoordinateSystem
-from s4a.input.plausibility import POSE, Flags
+from s4a.input.plausibility import Flags
 from s4a.input.subjects import read_table
 from s4a.method.alignment import N_VOTERS
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca_without
 from s4a.method.remesh import check_wrap
 from s4a.options import Options, given_options
-from s4a.schema import dataset
+from s4a.schema import POSE, dataset
 from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
 from s4a.study.processes import limited, temporary_folder
 from s4a.study.quality_control import (

@@ -11,7 +11,6 @@ import xarray as xr
 
 from s4a.geometry.crossing import can_count
 from s4a.input.plausibility import (
-    POSE,
     Flag,
     Flags,
     find_warnings,
@@ -20,6 +19,7 @@ from s4a.input.plausibility import (
     pick_references,
 )
 from s4a.options import Options
+from s4a.schema import POSE
 from s4a.study.netcdf import arrays, attributes, open_file, read
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.store import task_key

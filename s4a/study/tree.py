@@ -8,9 +8,8 @@ import numpy as np
 import xarray as xr
 
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.input.plausibility import POSE
 from s4a.options import kept_options
-from s4a.schema import INPUT, in_unit, unit_of, variable
+from s4a.schema import INPUT, POSE, in_unit, unit_of, variable
 from s4a.study.contents import check_contents, check_fit, check_name
 from s4a.study.netcdf import DamagedError, damage_named, open_file, read, read_tree, stacked
 from s4a.study.store import check_is_study, write
