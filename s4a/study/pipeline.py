@@ -305,6 +305,8 @@ def remesh(run: Run, original: Keys, options: Options) -> Keys:
         settings = (*settings, "refined eigenfunctions")
     if options.method != "rematch":
         settings = (*settings, options.method)
+    if options.sampling != "normals":
+        settings = (*settings, options.sampling)
     todo = [
         Task(
             n,
