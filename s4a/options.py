@@ -297,15 +297,10 @@ class Options:
         "describes the format.  Only ``reflect`` and the statistics use the table.  Without a "
         "table, the table of an earlier run is kept")
     landmarks: Path | str | None = reading(None,
-<<<<<<< HEAD
-        "folder of landmark files, named as the shapes, that guide registration",
-        more="The formats are those of :func:`s4a.input.annotations.read_landmarks`.  Shapes "
-        "without a file "
-=======
         "folder of landmark files, named as the shapes, that guide alignment and elastic "
         "registration",
-        more="The formats are 3D Slicer (.mrk.json), CSV and MeshLab (.pp).  Shapes without a file "
->>>>>>> 6a8eb14ce43ca2a13d318dcdfa662767a954f27c
+        more="The formats are those of :func:`s4a.input.annotations.read_landmarks`.  Shapes "
+        "without a file "
         "have no landmarks.  Landmarks of two shapes are paired by name.  "
         ":func:`s4a.with_landmarks` adds landmarks to a mesh in memory")
     features: str | list[str] | None = reading(None,
