@@ -31,7 +31,7 @@ import s4a
 import s4a_morphometrics
 from s4a import metrics, statistics, synthetic
 from s4a.analysis import permutation, transfer
-from s4a.geometry.align import align, farthest_points
+from s4a.geometry.align import align, cloud, farthest_points
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, vertex_areas
 from s4a.input.annotations import labels_of_mesh, read_landmarks
@@ -53,7 +53,7 @@ def icp_motion(source, target):
     for mesh in (source, target):
         X, T = as_arrays(mesh)
         every = slice(None, None, max(1, len(X) // 6000))
-        low += [X[every], vertex_areas(X, T)[every]]
+        low.append(cloud(X[every], vertex_areas(X, T)[every], 500))
     return align(*low)[:2]
 
 

@@ -38,7 +38,7 @@ def errors(source, target, image):
     """
     with threadpool_limits(1):
         M, N = shape_of(source), shape_of(target)
-        first = initial_map(M.low, N.low, align(M.low.X, M.low.area, N.low.X, N.low.area)[:2])
+        first = initial_map(M.low, N.low, align(M.low.cloud, N.low.cloud)[:2])
         starts = {
             "intrinsic": fmap.zoomout(M.low, N.low, first.C, 100)[1],
             "icp": first.near,

@@ -42,7 +42,7 @@ from threadpoolctl import threadpool_limits
 
 import s4a
 from s4a import synthetic
-from s4a.geometry.align import align
+from s4a.geometry.align import align, cloud
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_normals, vertex_areas, vertex_normals
 from s4a.input.annotations import read_landmarks
@@ -273,7 +273,7 @@ def begin(template, shape):
     for mesh in (template, shape):
         X, T = as_arrays(mesh)
         every = slice(None, None, max(1, len(X) // 6000))
-        clouds += [X[every], vertex_areas(X, T)[every]]
+        clouds.append(cloud(X[every], vertex_areas(X, T)[every], 500))
     R, t = align(*clouds)[:2]
     return template["position"].values @ R.T + t
 

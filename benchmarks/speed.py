@@ -346,7 +346,7 @@ def stages(folder):
     meshes = [(a.X, a.T), (b.X, b.T)]
     (R, t, _), _ = beside(
         "align, any start",
-        ("s4a.geometry.align", align, a.X, a.area, b.X, b.area),
+        ("s4a.geometry.align", align, a.cloud, b.cloud),
         ("pymeshlab ICP, one start", other_icp, *meshes),
     )
     few = [(end.X, end.T, end.Phi, end.eigenvalue) for end in (a, b)]
@@ -401,7 +401,7 @@ def network_table():
         map_after_alignment(
             low[i],
             low[j],
-            align(low[i].X, low[i].area, low[j].X, low[j].area)[:2],
+            align(low[i].cloud, low[j].cloud)[:2],
             k_init=K_INIT,
         ).C
         for i, j in zip(source, target, strict=True)
@@ -699,7 +699,7 @@ def certificates(folder, n_checked=1000):
             continue
         meshes = [s4a.read_shape(file) for file in files]
         M, N = (Shape(mesh, s4a.spectrum(s4a.coarsen(mesh), k=K)) for mesh in meshes)
-        transform = align(M.low.X, M.low.area, N.low.X, N.low.area)[:2]
+        transform = align(M.low.cloud, N.low.cloud)[:2]
         C = map_after_alignment(M.low, N.low, transform, k_init=K_INIT).C
         C = fmap.zoomout(M.low, N.low, C, min(K, M.low.k, N.low.k))[0]
         F = M.low.Phi[:, : C.shape[1]] @ C.T, N.low.Phi[:, : C.shape[0]]

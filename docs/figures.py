@@ -221,7 +221,7 @@ def variance(study):
     registration = study["registration"].to_dataset()
     names = registration["shape"].values.tolist()
     R, t = registration["icp_rotation"].values, registration["icp_translation"].values
-    options = {"refine": "intrinsic", "alignment": "icp"}
+    options = {"refine": "intrinsic", "displacement_alignment": "initial"}
     fields = [
         s4a.register_shape(study, name, initial_transform=transform, **options)
         for name, *transform in zip(names, R, t, strict=True)

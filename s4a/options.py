@@ -170,7 +170,7 @@ def check(name: str, value: Any) -> Any:
     >>> from s4a.options import check
     >>> check("init", "landmark")
     Traceback (most recent call last):
-    ValueError: init must be one of 'dense', 'landmarks'; found 'landmark'
+    ValueError: init must be one of 'dense', 'landmarks', 'wave_kernels'; found 'landmark'
     """
     from s4a.schema import check_choice, check_count, check_switch, check_text
 
@@ -297,7 +297,8 @@ class Options:
         "describes the format.  Only ``reflect`` and the statistics use the table.  Without a "
         "table, the table of an earlier run is kept")
     landmarks: Path | str | None = reading(None,
-        "folder of landmark files, named as the shapes, that guide registration",
+        "folder of landmark files, named as the shapes, that guide alignment and elastic "
+        "registration",
         more="The formats are those of :func:`s4a.input.annotations.read_landmarks`.  Shapes "
         "without a file "
         "have no landmarks.  Landmarks of two shapes are paired by name.  "
@@ -321,6 +322,12 @@ class Options:
         more="The meshes have between 95 and 110 % of this number, usually 95 %: 5,700 of 6,000, "
         "since the rest is for repairs of the topology.  With SCALABLE it is the number "
         "of samples")
+    sampling: str = network("normals",
+        "samples of the low-resolution meshes: farthest points in position and normal (normals), "
+        "or, as in ReMatching, along the surface, with U from closest points in space (geodesic)",
+        choices=("normals", "geodesic"), section="4.1, step 1", see="method/remesh",
+        of="low resolution", pair=True,
+        more="Geodesic samples ignore curvature, and U then crosses thin walls")
     wrap: bool = network(False, "wrap the shapes in a watertight surface before remeshing",
         of="low resolution")
     refined_eigenfunctions: bool = network(False,
@@ -337,9 +344,20 @@ class Options:
         of="low resolution", pair=True)
     n_pairs: int = network(500, "number of pairs in the network, each with maps in both directions",
         least=1, section="5.1", more="All pairs are used if there are fewer")
+    alignment: str = network("search",
+        "rigid alignment: the best of several results of ICP in position and normal (search), "
+        "plain ICP from the pose of the files (icp), or that pose, with centroids aligned (given)",
+        choices=("search", "icp", "given"), paper="icp", section="4.1, step 2",
+        instead="ICP from the pose of the files", see="method/alignment", of="initial maps",
+        pair=True,
+        more="The search starts at the principal axes, so its result does not depend on the pose "
+        "of the files.  A shape that fits others alike in two poses is flagged.  Landmarks replace "
+        "the search and the pose from which plain ICP starts.  Use 'given' for aligned data")
     init: str = network("dense",
-        "initial maps from the nearest neighbours of all vertices, or from 10 landmarks",
-        choices=("dense", "landmarks"), paper="landmarks", section="4.1, steps 3 and 4",
+        "initial maps from nearest neighbours of all vertices (dense), from 10 landmarks, or as "
+        "in pyFM from wave kernels of the shapes and around these landmarks (wave_kernels)",
+        choices=("dense", "landmarks", "wave_kernels"), paper="landmarks",
+        section="4.1, steps 3 and 4",
         instead="initial map fitted to 10 landmarks", see="method/initial_map", of="initial maps",
         pair=True,
         more="Nearest neighbours are found after ICP.  If poses differ a lot, the best of several "
@@ -357,10 +375,11 @@ class Options:
     n_latent: int | None = network(None, "dimension of the latent space; by default k", least=2,
         section="eq. 3")
     weights: str = network("cycles",
-        "weights of the maps: from their cycle errors (cycles), or all 1 (equal)",
-        choices=("cycles", "equal"), section="eq. 3", see="method/network")
+        "weights of the maps: from their mean cycle errors (cycles), as in pyFM from errors by a "
+        "linear program (linear_program), or all 1 (equal)",
+        choices=("cycles", "linear_program", "equal"), section="eq. 3", see="method/network")
     isometric: bool = network(False,
-        "before each iteration of Consistent ZoomOut, replace the two maps of a pair by the more "
+        "before each latent basis of Consistent ZoomOut, replace both maps of a pair by the more "
         "orthogonal one and its transpose, as pyFM does", section="4.2", see="method/latent",
         more="The maps then preserve area, so the energies of eq. 5 are smaller.  In pyFM this is "
         "``isometric`` of ``FMN.zoomout_refine``, which is True by default")
@@ -415,12 +434,12 @@ class Options:
         "transfer only: match pairs in both directions and average the results",
         paper=False, section="6.2", instead="a template registered to a shape",
         see="analysis/transfer", pair=True, more="It is an option of :func:`s4a.register_pairs`")
-    alignment: str = registration("fitted",
+    displacement_alignment: str = registration("fitted",
         "rigid alignment to the template before displacements are computed: best fit of the "
-        "registered surface (fitted), or ICP before the registration (icp)",
-        choices=("fitted", "icp"), paper="icp", section="eq. 8",
+        "registered surface (fitted), or the initial alignment (initial)",
+        choices=("fitted", "initial"), paper="initial", section="eq. 8",
         instead="after ICP (4.1, step 2)", see="method/deform", of="registration", pair=True,
-        more="With 'icp', eq. 8 holds as printed in the paper")
+        more="With 'initial', eq. 8 holds as printed in the paper")
     area_weighted: bool = registration(True,
         "weight vertices by area when displacements are projected onto U Phi", paper=False,
         section="after eq. 8", instead="$(U \\phi)^\\dagger$ as printed", see="method/deform",
@@ -477,13 +496,13 @@ class Options:
                 "features= are fields on the vertices of meshes, and label= extracts meshes from "
                 "volumes, whose vertices are not known before"
             )
-        elif self.landmarks is not None and self.refine != "elastic":
-            why = f"landmarks guide elastic iterations, and refine={self.refine!r} has none"
         elif self.method == "scalable" and without:
             why = (
                 f"method='scalable' has no coarse mesh, and {without[0]}=True "
                 f"{WITHOUT_MESH[without[0]]}"
             )
+        elif self.method == "scalable" and self.sampling != "normals":
+            why = f"method='scalable' has samples of its own, and sampling={self.sampling!r} others"
         elif self.include_flagged and self.quality_control == "stop":
             why = (
                 "include_flagged=True includes flagged shapes and quality_control='stop' ends the "

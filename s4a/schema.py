@@ -16,6 +16,7 @@ from s4a.extensions import extensions
 
 Array = np.ndarray  # of numbers; its dims and kind stand in the docstring
 INPUT = "unit of the input"
+POSE = "pose"  # the kind of a flag for an ambiguous pose
 INPUT2 = "squared unit of the input"
 FIELD_UNIT = "unit of the field"
 ONE = "1"
@@ -113,7 +114,7 @@ pair_translation | pair xyz | share | translation t of ICP, source to target
 landmark_of_source | pair landmark | 1 | coarse vertices of the source used as landmarks for the
     initial map (4.1, step 3)
 landmark_of_target | pair landmark | 1 | coarse vertices of the target nearest to them after ICP
-pair_residual | pair | share | residual of ICP: trimmed root mean square distance of nearest
+pair_residual | pair | share | residual of ICP: root mean square distance of nearest
     vertices, in both directions
 descriptor_of_source | pair eigenpair_source_initial descriptor | 1 | coefficients of descriptors of
     the source, each of norm 1, to which the initial map is fitted (4.1, step 4)
@@ -391,7 +392,8 @@ HOLDS = {
     ),
     "network/comparison": ("moment fit fit_mirrored chirality", "", SEEN),
     "network/chirality": ("shape mean_chirality reflected", "remarks", ""),
-    "network/alignment": ("rotation translation", "reference", "residual"),
+    "network/voters": ("shape rotation translation", "", ""),
+    "network/alignment": ("rotation translation", "reference ambiguity", "residual n_poses"),
     "network/initial": ("source target fmap_initial", "", ""),
     "network": ("source target fmap_initial fmap weight cycle_error", "", ""),
     "latent": (

@@ -29,7 +29,7 @@ from s4a.analysis.inputs import registration_of
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
 from s4a.input.plausibility import evenly_chosen
-from s4a.method.initial_map import transform_onto
+from s4a.method.alignment import transform_onto
 from s4a.method.pca import gram
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape

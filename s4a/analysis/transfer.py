@@ -725,8 +725,8 @@ def transfer_landmarks(
     named = marked[[name for name in NAMED if name in marked]]
     transferred = {}
     for name, target, routes in routes_to_targets:
-        landmarks = _transfer_landmarks(marked, target, routes).merge(named)
-        transferred[name] = landmarks.assign_attrs(CoordinateSystem.of(target.attrs).attrs)
+        image = _transfer_landmarks(marked, target, routes).merge(named)
+        transferred[name] = image.assign_attrs(CoordinateSystem.of(target.attrs).attrs)
     return xr.DataTree.from_dict(transferred)
 
 

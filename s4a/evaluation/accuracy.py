@@ -34,7 +34,7 @@ def simple_matches(source: Shape, target: Shape, *, k_init: int = 20) -> dict[st
         Method -> int ndarray (n_target,), vertices of the source.
     """
     M, N = source.low, target.low
-    R, t, _ = align(M.X, M.area, N.X, N.area)
+    R, t, _ = align(M.cloud, N.cloud)
     near = nearest_after_alignment(source.full, target.full, (R, t))
     C = map_after_alignment(M, N, (R, t), k_init=k_init).C
     k = min(M.k, N.k)

@@ -545,8 +545,7 @@ def initial_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.n
     reference = bases[int(np.argmin(distance.sum(1)))]
     identity = np.eye(3), np.zeros(3)
     transforms = [
-        identity if M is reference else align(M.X, M.area, reference.X, reference.area)[:2]
-        for M in bases
+        identity if M is reference else align(M.cloud, reference.cloud)[:2] for M in bases
     ]
     settings: dict[str, Any] = {"k_init": k_init, "init": options.init}
     settings["n_samples"] = options.n_samples

@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import RigidTransform, align, farthest_points
+from s4a.geometry.align import N_PAIRED, RigidTransform, align, cloud, farthest_points
 from s4a.geometry.closest import match_surfaces
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import fmap
@@ -256,17 +256,17 @@ class Pair:
     def align_samples(self) -> tuple[RigidTransform, Matches, float]:
         """Rigid transform and landmarks from samples of both shapes, and the seconds spent."""
         (X, area, _), (Y, area_target, _) = self.source.samples, self.target.samples
-        return self._align(X, area, Y, area_target)
+        return self._align(cloud(X, area, N_PAIRED), cloud(Y, area_target, N_PAIRED))
 
     @cached_property
     def align_remeshed(self) -> tuple[RigidTransform, Matches, float]:
         """Rigid transform and landmarks from the low-resolution meshes, and the seconds spent."""
         M, N = self.source.coarse.low, self.target.coarse.low
-        return self._align(M.X, M.area, N.X, N.area)
+        return self._align(M.cloud, N.cloud)
 
-    def _align(self, X, area, Y, area_target):
+    def _align(self, source, target):
         clock = Clock()
-        R, t, _ = clock("align", align, X, area, Y, area_target)
+        R, t, _ = clock("align", align, source, target)
         landmarks = self.landmarks
         if landmarks is None:
             landmarks = clock(

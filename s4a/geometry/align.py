@@ -3,7 +3,6 @@
 A transform ``R, t`` maps x to R x + t, rows of X to ``X @ R.T + t``.
 """
 
-import itertools
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -18,10 +17,13 @@ RigidTransform = tuple[Array, Array]  # R (3, 3), t (3,)
 IcpResult = tuple[Array, Array, float]  # R, t and the residual
 
 ROUGH = 2e-5  # tolerance for few points, or for results that are only compared: twice the default
-N_POINTS = 300  # farthest-point samples of each shape used to compare initialisations
-CLEARLY, PREFER = 0.98, 0.9  # see align
-TRIM = 0.1
-TILT = 15.0  # degrees, in both directions
+N_PAIRED = 500  # farthest-point samples of each shape that are paired with nearest neighbours
+N_ROUGH = 100  # of them, those that are paired to compare many initial rotations
+# of unit normals relative to positions: pairs of points on different folds are farther apart
+NORMAL_WEIGHT = 0.2
+SIMILAR = 1.2  # ratio of the extents along two principal axes below which they can be exchanged
+DISTINCT = 45.0  # degrees between two poses
+N_POSES = 4  # poses that are compared with all samples
 residual_of = itemgetter(2)  # the residual of an ICP result
 
 
@@ -30,8 +32,17 @@ class Cloud(NamedTuple):
 
     X: Array  # (n, 3)
     area: Array  # (n,)
-    tree: cKDTree  # of all vertices
+    tree: cKDTree  # of the rows of all vertices
     paired: Array  # indices of the vertices paired with their nearest neighbours
+    normals: Array | None = None  # (n, 3), unit normals if they are used
+
+    def rows(self, i: Array | slice = slice(None), R: Array | None = None, t: Any = 0) -> Array:
+        """Return positions and weighted normals of some vertices ``(p, 3 or 6)``, moved by R, t."""
+        R = np.eye(3) if R is None else R
+        moved = self.X[i] @ R.T + t
+        if self.normals is None:
+            return moved
+        return np.concatenate([moved, NORMAL_WEIGHT * self.normals[i] @ R.T], axis=1)
 
 
 def rigid_transform(
@@ -199,10 +210,18 @@ def principal_axes(X: Array, area: Array) -> tuple[Array, Array]:
     return c, V * np.array([1, 1, np.sign(np.linalg.det(V))])
 
 
-def cloud(X: Array, area: Array, n_points: int | None = None) -> Cloud:
-    """Prepare vertices and areas for ICP, which pairs `n_points` samples of them (or all)."""
-    paired = np.arange(len(X)) if n_points is None else farthest_points(X, n_points)
-    return Cloud(X, area, cKDTree(X), paired)
+def cloud(
+    X: Array, area: Array, paired: int | Array | None = None, normals: Array | None = None
+) -> Cloud:
+    """Prepare vertices, areas and normals for ICP.
+
+    `paired` are the vertices that it pairs, or the number of farthest-point samples; all by
+    default.
+    """
+    if paired is None or isinstance(paired, int):
+        paired = farthest_points(X, len(X) if paired is None else paired)
+    bare = Cloud(X, area, cKDTree(X), paired, normals)
+    return bare if normals is None else bare._replace(tree=cKDTree(bare.rows()))
 
 
 def icp(source: Cloud, target: Cloud, R: Array, t: Array, **options: Any) -> IcpResult:
@@ -217,13 +236,14 @@ def icp_each(
     *,
     iterations: int = 60,
     tolerance: float = 1e-5,
+    trim: float = 0.0,
 ) -> list[IcpResult]:
-    """Trimmed, bidirectional iterative closest points from several initial transforms.
+    """Bidirectional iterative closest points from several initial transforms.
 
     Each iteration pairs vertices of the source with the nearest of the target and vertices of the
-    target with the nearest of the source, drops the farthest ``TRIM`` of the pairs, and solves for
-    the transform of the source, weighted by area.  Neighbours of all initialisations that have not
-    converged are queried together.
+    target with the nearest of the source, in position and normal if the clouds have normals, and
+    solves for the transform of the source, weighted by area.  Neighbours of all initialisations
+    that have not converged are queried together.
 
     Parameters
     ----------
@@ -234,12 +254,14 @@ def icp_each(
         At least 1.
     tolerance : float
         Stop when the residual decreases by less, as a share of sqrt(area of the source).
+    trim : float
+        Share of the pairs that are dropped, the farthest ones.
 
     Returns
     -------
     list of tuple (R, t, residual)
-        The transform R x + t, and the trimmed root mean square distance of the pairs in both
-        directions.
+        The transform R x + t, and the root mean square distance of the pairs in both directions,
+        with the difference of weighted normals if there are normals.
 
     References
     ----------
@@ -252,8 +274,9 @@ def icp_each(
     ends: list[IcpResult] = [(R, t, np.inf) for R, t in starts]
     moving = list(range(len(ends)))
     for _ in range(iterations):
-        forth = _nearest(target, [X @ R.T + t for R, t, _ in (ends[i] for i in moving)])
-        back = _nearest(source, [(Y - t) @ R for R, t, _ in (ends[i] for i in moving)])
+        now = [ends[i][:2] for i in moving]
+        forth = _nearest(target, [source.rows(source.paired, R, t) for R, t in now])
+        back = _nearest(source, [target.rows(target.paired, R.T, -t @ R) for R, t in now])
         moved, moving = moving, []
         for i, (there, forth_distance), (here, back_distance) in zip(
             moved, forth, back, strict=True
@@ -262,7 +285,7 @@ def icp_each(
             Q = np.concatenate([target.X[there], Y])
             distance = np.concatenate([forth_distance, back_distance])
             # mutual nearest neighbours are kept or dropped together, whatever the rounding
-            keep = distance <= (1 + 1e-9) * np.quantile(distance, 1 - TRIM)
+            keep = distance <= (1 + 1e-9) * np.quantile(distance, 1 - trim)
             residual = float(np.sqrt(weight[keep] @ distance[keep] ** 2 / weight[keep].sum()))
             R, t, _ = rigid_transform(P[keep], Q[keep], weight[keep])
             if ends[i][2] - residual >= least:
@@ -273,67 +296,98 @@ def icp_each(
     return ends
 
 
-def _nearest(shape, points):
-    """Nearest vertices of a cloud and their distances, for each array (p, 3) of a list."""
-    distance, nearest = shape.tree.query(np.concatenate(points))
-    each = (len(points), -1)
+def _nearest(shape, rows):
+    """Nearest vertices of a cloud and their distances, for each array (p, d) of a list."""
+    distance, nearest = shape.tree.query(np.concatenate(rows))
+    each = (len(rows), -1)
     return zip(nearest.reshape(each), distance.reshape(each), strict=True)
 
 
-def _try_tilts(source: Cloud, target: Cloud, start: IcpResult) -> IcpResult:
-    """Repeat ICP from its result tilted about each principal axis, as long as it improves.
+def point_to_point(source: Cloud, target: Cloud, R: Array, t: Array) -> IcpResult:
+    """Run plain ICP of Besl and McKay from one initial transform, without weights.
 
-    ICP alone stops when no pair changes: on folded surfaces up to 20 degrees from the best
-    rotation. With the principal axes of the target the result does not depend on the poses of the
-    files.
-
-    Parameters
-    ----------
-    source, target : Cloud
-    start : tuple (R, t, residual)
-        Result of an ICP.
+    Each iteration pairs every vertex of the source with the nearest of the target in space.
 
     Returns
     -------
-    R, t, residual
+    R, t, residual : as for :func:`icp_each`, in one direction
     """
-    _, axes = principal_axes(target.X, target.area)
-    tilts = [
-        axes @ Rotation.from_euler(axis, sign * TILT, degrees=True).as_matrix() @ axes.T
-        for axis in "xyz"
-        for sign in (1, -1)
-    ]
-    center = source.area @ source.X / source.area.sum()
-    best = start
-    for _ in range(5):
-        R, t, residual = best
-        middle = R @ center + t  # the tilts rotate X about its moved centre
-        starts = [(tilt @ R, tilt @ (t - middle) + middle) for tilt in tilts]
-        end = min(icp_each(source, target, starts, tolerance=ROUGH), key=residual_of)
-        if residual_of(end) > 0.999 * residual:
-            return best
-        best = end
-    return best
+    tree, least, residual = cKDTree(target.X), 1e-6 * np.sqrt(source.area.sum()), np.inf
+    for _ in range(200):
+        distance, nearest = tree.query(source.X @ R.T + t)
+        before, residual = residual, float(np.sqrt((distance**2).mean()))
+        if before - residual < least:
+            break
+        R, t, _ = rigid_transform(source.X, target.X[nearest])
+    return R, t, residual
 
 
-def align(X: Array, area: Array, Y: Array, area_y: Array) -> IcpResult:
-    """Rigid transform of X onto Y by ICP from several initial rotations.
+def initial_transforms(source: Cloud, target: Cloud) -> list[RigidTransform]:
+    """Return transforms that align centroids and principal axes.
 
-    The initialisations are compared with ``N_POINTS`` samples of each shape.  Two are refined with
-    tilts: of the four rotations that align principal axes, the best result within 90 degrees of the
-    result from the pose as given (centred), and the best of the others.  The former is kept unless
-    the residual of the latter is below ``PREFER`` times its own, since noise would otherwise flip
-    nearly symmetric shapes.  The pose as given replaces it only if the residual is below
-    ``CLEARLY`` times its own, as for shapes with ambiguous principal axes.  So the result does not
-    depend on the rotation of the files, if they lie within about 90 degrees of each other.  The
-    final result is refined on all vertices.
+    There are four, or 16 or 24 where the extents along principal axes are similar.  They depend on
+    the geometry of the shapes, not on the pose of the files.
 
-    Parameters
-    ----------
-    X, Y : float ndarray (n, 3), (p, 3)
-        Vertices, usually of low-resolution meshes.
-    area, area_y : float ndarray (n,), (p,)
-        Their areas.
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.align import cloud, initial_transforms
+    >>> box = np.array([[x, y, z] for x in (-3.0, 3) for y in (-2.0, 2) for z in (-1.0, 1)])
+    >>> stick = cloud(box, np.ones(8)), cloud(box * [1, 0.5, 1], np.ones(8))
+    >>> len(initial_transforms(stick[0], stick[0])), len(initial_transforms(*stick))
+    (4, 16)
+    """
+    (center, A, ratio), (center_y, B, ratio_y) = (
+        (*axes, _extent_ratios(shape, *axes))
+        for shape in (source, target)
+        for axes in [principal_axes(shape.X, shape.area)]
+    )
+    similar = tuple(np.minimum(ratio, ratio_y) < SIMILAR)
+    names = {(False, False): "D2", (True, False): "D8", (False, True): "D8", (True, True): "O"}
+    # D8: rotations by multiples of 45 degrees about an axis, and half turns about axes across it
+    group = Rotation.create_group(names[similar], "X" if similar[1] else "Z").as_matrix()
+    rotations = [B @ turn @ A.T for turn in group]
+    return [(R, center_y - R @ center) for R in rotations]
+
+
+def _extent_ratios(shape, center, axes):
+    """Ratios of the extents along the first two, and the last two, principal axes ``(2,)``."""
+    extent = np.sqrt(shape.area @ ((shape.X - center) @ axes) ** 2)
+    return extent[:2] / np.maximum(extent[1:], 1e-300)
+
+
+def poses(source: Cloud, target: Cloud) -> list[IcpResult]:
+    """Return distinct transforms of the source onto the target by ICP, the best first.
+
+    ICP starts at the :func:`initial_transforms`.  If there are many, few points are paired at
+    first.
+    """
+    starts = initial_transforms(source, target)
+    if len(starts) > N_POSES:
+        few = [
+            c._replace(paired=c.paired[farthest_points(c.X[c.paired], N_ROUGH)])
+            for c in (source, target)
+        ]
+        ends = icp_each(*few, starts, tolerance=1e-3, iterations=15)
+        starts = [(R, t) for R, t, _ in distinct(ends)[:N_POSES]]
+    return distinct(icp_each(source, target, starts, tolerance=ROUGH))
+
+
+def distinct(ends: list[IcpResult]) -> list[IcpResult]:
+    """Sort results of ICP by residual, and omit those within ``DISTINCT`` degrees of a better."""
+    chosen: list[IcpResult] = []
+    for end in sorted(ends, key=residual_of):
+        # the trace of a rotation is 1 + 2 cos(angle)
+        cosines = [(np.trace(end[0].T @ other[0]) - 1) / 2 for other in chosen]
+        if max(cosines, default=-1.0) < np.cos(np.deg2rad(DISTINCT)):
+            chosen.append(end)
+    return chosen
+
+
+def align(source: Cloud, target: Cloud) -> IcpResult:
+    """Rigid transform of the source onto the target: the best of :func:`poses`.
+
+    The result does not depend on the pose of the files.
 
     Returns
     -------
@@ -341,31 +395,10 @@ def align(X: Array, area: Array, Y: Array, area_y: Array) -> IcpResult:
 
     See Also
     --------
-    icp : ICP from one initial transform.
+    s4a.method.alignment.align_onto : Also detect poses that fit alike.
     rigid_transform : least-squares transform of corresponding points.
     """
-    center, A = principal_axes(X, area)
-    center_y, B = principal_axes(Y, area_y)
-    flips = [np.diag(d) for d in itertools.product((1, -1), repeat=3) if np.prod(d) == 1]
-    rotations = [np.eye(3)] + [B @ flip @ A.T for flip in flips]
-    starts = [(R, center_y - R @ center) for R in rotations]
-    source, target = cloud(X, area, N_POINTS), cloud(Y, area_y, N_POINTS)
-    posed, *rotated = icp_each(source, target, starts, tolerance=ROUGH)
-    # the trace of a rotation is 1 + 2 cos(angle): 1 at 90 degrees
-    as_posed = [np.trace(R.T @ posed[0]) >= 1 for R, _, _ in rotated]
-    upright, upside_down = (
-        list(itertools.compress(rotated, side)) for side in (as_posed, np.invert(as_posed))
-    )
-    best, other = (
-        _try_tilts(source, target, min(ends, key=residual_of)) if ends else None
-        for ends in (upright, upside_down)
-    )
-    if best is None or CLEARLY * residual_of(best) > residual_of(posed):
-        best = _try_tilts(source, target, posed)
-    if other is not None and residual_of(other) < PREFER * residual_of(best):
-        best = other
-    R, t, _ = best
-    return icp(cloud(X, area), cloud(Y, area_y), R, t)
+    return poses(source, target)[0]
 
 
 def realign(source: Cloud, target: Cloud, start: RigidTransform) -> RigidTransform:

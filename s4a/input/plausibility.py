@@ -3,7 +3,6 @@
 Suspect shapes are reported and never changed.
 """
 
-import itertools
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,14 @@ import numpy as np
 import xarray as xr
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import Cloud, cloud, icp_each, principal_axes, residual_of
+from s4a.geometry.align import (
+    Cloud,
+    cloud,
+    icp_each,
+    initial_transforms,
+    principal_axes,
+    residual_of,
+)
 from s4a.geometry.crossing import can_count, count_crossing
 from s4a.geometry.mesh import (
     as_arrays,
@@ -37,13 +43,13 @@ from s4a.schema import dataset
 N_POINTS = 3000  # vertices of each shape that are used
 N_PAIRED = 300  # of them, those that ICP pairs
 N_ROUGH = 100  # of them, those that ICP pairs while it compares initialisations
+TRIM = 0.1  # share of the pairs that ICP drops, the farthest ones, such as missing parts
 N_REFERENCES = 6  # shapes that every shape is compared with
 _ENOUGH = 5  # shapes from which deviations are estimated
 _USUAL = 3.0  # deviations within which a shape can be a reference
 # least deviations, of logarithms; in collections that vary less every shape would be an outlier
 SIZE, COMPACTNESS, MOMENT = 0.05, 0.03, 0.05
 _TINY = 1e-3  # smaller distances, of identical shapes, are no evidence
-_HALF_TURNS = [np.diag(d) for d in itertools.product((1.0, -1.0), repeat=3) if np.prod(d) == 1]
 
 
 def describe(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
@@ -285,7 +291,6 @@ class View:
 
     cloud: Cloud
     rough: Cloud  # pairs fewer of its vertices
-    axes: np.ndarray  # (3, 3)
     normal: np.ndarray  # (n, 3)
 
 
@@ -294,23 +299,21 @@ def view(descriptor: xr.Dataset, flip: np.ndarray | float = 1.0) -> View:
     X, area = descriptor["descriptor_position"].values * flip, descriptor["descriptor_area"].values
     fine = cloud(X, area, N_PAIRED)
     rough = Cloud(X, area, fine.tree, fine.paired[:N_ROUGH])
-    axes = principal_axes(X, area)[1]
-    return View(fine, rough, axes, descriptor["descriptor_normal"].values * flip)
+    return View(fine, rough, descriptor["descriptor_normal"].values * flip)
 
 
 def _best_pose(shape, reference):
-    """Align a shape to a reference by ICP from eight rotations, of the file and of the axes.
+    """Align a shape to a reference by ICP from rotations that align principal axes.
 
     Returns
     -------
     R, t, residual
         As of :func:`s4a.geometry.align.icp_each`.
     """
-    rotations = _HALF_TURNS + [reference.axes @ turn @ shape.axes.T for turn in _HALF_TURNS]
-    initial = [(R, np.zeros(3)) for R in rotations]
-    rough = icp_each(shape.rough, reference.rough, initial, tolerance=1e-3, iterations=5)
+    initial = initial_transforms(shape.cloud, reference.cloud)
+    rough = icp_each(shape.rough, reference.rough, initial, tolerance=1e-3, iterations=5, trim=TRIM)
     best = [(R, t) for R, t, _ in sorted(rough, key=residual_of)[:2]]
-    poses = icp_each(shape.cloud, reference.cloud, best, tolerance=1e-4, iterations=30)
+    poses = icp_each(shape.cloud, reference.cloud, best, tolerance=1e-4, iterations=30, trim=TRIM)
     return min(poses, key=residual_of)
 
 
@@ -398,6 +401,9 @@ KINDS = {
     "kind": (False, "outlier: {what} {deviations:.0f} robust deviations from the median; is it "
         "another kind of shape, stretched, or only a part? Remove it if it does not belong "
         "to the collection", "remove the files if they are of another kind"),
+    "pose": (True, "ambiguous pose: {number} poses fit alike (residual {best:.3f}, and rotated by "
+        "{angle:.0f} degrees {second:.3f} sqrt(area)); give landmarks=, or alignment='given' if "
+        "the files are aligned", "give --landmarks, or --alignment given if the files are aligned"),
     "registration": (True, "registration {sure} (score {registration_error:.3f}{distortion}): "
         "inspect it with s4a view, compare its file with the template's, or remove it",
         "look at the page; a larger --n-coarse may help"),

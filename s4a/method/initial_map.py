@@ -1,4 +1,4 @@
-"""Initial functional maps (4.1, steps 2 to 4), and their refinement by a step of ZoomOut (4.2).
+"""Initial functional maps (4.1, steps 3 and 4), and their refinement by a step of ZoomOut (4.2).
 
 As in the paper, maps are fitted to nearest neighbours after ICP, of all vertices or 10 landmarks.
 If poses differ much, these are wrong, and the best of several maps is used.
@@ -13,15 +13,7 @@ import xarray as xr
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import (
-    RigidTransform,
-    align,
-    farthest_points,
-    icp,
-    realign,
-    residual_of,
-    rigid_transform,
-)
+from s4a.geometry.align import RigidTransform, farthest_points
 from s4a.geometry.closest import POSITION_WEIGHT
 from s4a.geometry.mesh import edges
 from s4a.method import fmap, spectral_icp
@@ -36,7 +28,6 @@ SEARCHED = tuple(itertools.product(("hks+wks", "wks", "hks"), (0.5, 1.0, 1.5), (
 N_ENDS, N_ENDS_OTHER = 5, 7  # extremities of one shape, matched to some of those of the other
 N_PAIRED = 8  # number of best pairings
 _CURVATURE = 3.0  # weight of mean curvature relative to a signature
-_COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
 _CURVATURE_WEIGHT = 0.3  # of the curvature difference in the score of a search
 SHORT = 60  # functions of the short ZoomOut before a map is scored
 _MAX_SCORE = 0.07  # at which the search ends; wrong maps between bodies score 0.11 or more
@@ -61,25 +52,6 @@ class _InitialMap(NamedTuple):
         F, G = (values.astype(np.float32) for values in self.descriptors)
         descriptors = {"descriptor_of_source": F, "descriptor_of_target": G}
         return dataset(None, **energies, **(descriptors if keep_descriptors else {}))
-
-
-def transform_onto(source: Basis, target: Basis) -> RigidTransform:
-    """Return the rigid transform (R, t) of the source onto the target by ICP (4.1, step 2).
-
-    Three or more common landmarks that are not collinear give the initial transform.
-    """
-    at_source, at_target = corresponding_landmarks(source, target)
-    P = source.X[at_source]
-    if len(P) < 3 or np.linalg.svd(P - P.mean(0), compute_uv=False)[1] < _COLLINEAR:
-        R, t, _ = align(source.X, source.area, target.X, target.area)
-        return R, t
-    R, t, _ = rigid_transform(P, target.X[at_target])
-    return realign(source.cloud, target.cloud, (R, t))
-
-
-def alignment_residual(source: Basis, target: Basis, transform: RigidTransform) -> float:
-    """Trimmed root mean square distance of nearest vertices after a transform of the source."""
-    return residual_of(icp(source.cloud, target.cloud, *transform, iterations=1))
 
 
 def nearest_after_alignment(source: Basis, target: Basis, transform: RigidTransform) -> Array:
@@ -120,6 +92,9 @@ def fit_after_alignment(
         C = fmap.fmap_from_match(M.Phi, N.Phi, N.mass, near)
         return _InitialMap(init, C, C, near)
     landmarks = landmarks_after_alignment(M.X, N.X, transform)
+    if init == "wave_kernels":
+        C = fmap.fmap_from_wave_kernels(source, target, *landmarks, k=k_init)
+        return _InitialMap(init, C, C, near, landmarks)
     C = fmap.fmap_from_landmarks(M, N, *landmarks)
     F, G = fmap.landmark_descriptors(M, N, *landmarks)
     energies = fmap.landmark_energies(M, N, C, F, G)
@@ -144,8 +119,9 @@ def map_after_alignment(
         At low resolution.
     transform : tuple (R, t)
         Rigid transform of the source onto the target (step 2).
-    init : {"dense", "landmarks"}
-        Fit to nearest neighbours of all vertices, or as in the paper to 10 farthest points.
+    init : {"dense", "landmarks", "wave_kernels"}
+        Fit to nearest neighbours of all vertices, as in the paper to 10 farthest points, or to wave
+        kernels of the shapes and around these points.
     initial_refinement : bool
         Whether to refine the map by a step of ZoomOut (4.2).
     n_samples : int

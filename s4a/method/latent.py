@@ -16,7 +16,8 @@ from scipy.sparse.csgraph import breadth_first_order
 from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import cKDTree
 
-from s4a.geometry.align import RigidTransform, realign
+from s4a.geometry.align import RigidTransform
+from s4a.method.alignment import pair_transform
 from s4a.method.fmap import fmap_from_match, orthogonality_error
 from s4a.method.initial_map import initial_map
 from s4a.method.median import area_differences, conformal_differences, distance_to_identity
@@ -32,6 +33,7 @@ from s4a.method.network import (
     cycle_errors,
     cycle_weights,
     in_threads,
+    program_errors,
     spectral_distance,
     three_cycles,
 )
@@ -330,10 +332,11 @@ def consistent_zoomout(
         Growth per iteration.
     n_latent : int, optional
         Final latent dimension; k by default.
-    weights : {"cycles", "equal"}
-        Weights of the maps: by cycle error, or 1 for all.
+    weights : {"cycles", "linear_program", "equal"}
+        Weights of the maps: by cycle error, by the errors of
+        :func:`s4a.method.network.program_errors`, or 1 for all.
     isometric : bool
-        Whether each iteration starts with :func:`isometric_maps`.
+        Whether :func:`isometric_maps` come before each latent basis, also the last.
     samples : list of int ndarray, optional
         Farthest-point samples of every shape, at least 2 k unless they are all vertices; all
         vertices by default.
@@ -376,9 +379,10 @@ def consistent_zoomout(
     for size, next_size in zip(
         sizes, [*sizes[1:], None], strict=True
     ):  # the last only solves for Y
-        C = isometric_maps(C, source, target) if isometric and next_size else C
-        error = cycle_errors(C, cycles, n_jobs=n_jobs)
-        weight = cycle_weights(error) if weights == "cycles" else np.ones(len(C))
+        C = isometric_maps(C, source, target) if isometric else C
+        by_program = weights == "linear_program"
+        error = program_errors(C, cycles) if by_program else cycle_errors(C, cycles, n_jobs=n_jobs)
+        weight = np.ones(len(C)) if weights == "equal" else cycle_weights(error)
         m = latent_size(n_latent, size, k)
         tolerance = ROUGH if next_size else FINE
         Y, latent_eigenvalue = latent_basis(
@@ -627,6 +631,7 @@ def out_of_sample_basis(
     k_init: int = 20,
     step: int = 5,
     n_samples: int = N_SAMPLES,
+    alignment: str = "search",
     **options: Any,
 ) -> Array:
     """Compute the latent basis of an out-of-sample shape; the bases of the others stay fixed.
@@ -640,7 +645,7 @@ def out_of_sample_basis(
         Latent bases of the others.
     transforms : list of tuple (R, t)
         Approximate rigid transforms of the new shape onto each of the others.
-    k_init, step, n_samples : see :func:`s4a.analyse`
+    k_init, step, n_samples, alignment : see :func:`s4a.analyse`
     **options
         Options of :func:`s4a.method.initial_map.initial_map`.
 
@@ -650,7 +655,7 @@ def out_of_sample_basis(
     """
     maps = []
     for other, transform in zip(others, transforms, strict=True):
-        R, t = realign(new.cloud, other.cloud, transform)
+        R, t = pair_transform(new, other, transform, alignment)
         back = R.T, -R.T @ t
         maps.append(initial_map(other, new, back, k_init=k_init, n_samples=n_samples, **options).C)
     return _zoomout_of_new(new, others, Y, maps, step=step, n_samples=n_samples)

@@ -272,7 +272,7 @@ def register(
     refine: str = "elastic",
     remove_size: bool = False,
     articulated: bool = True,
-    alignment: str = "fitted",
+    displacement_alignment: str = "fitted",
 ) -> xr.Dataset:
     """Register one shape to the template at full resolution.
 
@@ -298,9 +298,9 @@ def register(
         Whether to remove size from the displacement.
     articulated : bool
         Whether spectral ICP may be piecewise rigid if poses differ.
-    alignment : {"fitted", "icp"}
+    displacement_alignment : {"fitted", "initial"}
         Measure the displacement after the rigid transform that fits the registered surface best, or
-        after that of ICP as in the paper; then eq. 8 and (U Phi)(U Phi)^+ hold as printed.
+        after the initial one as in the paper; then eq. 8 and (U Phi)(U Phi)^+ hold as printed.
 
     Returns
     -------
@@ -316,13 +316,13 @@ def register(
         candidate with the best ``score`` at full resolution, and ``score_<candidate>`` at low
         resolution.
     """
-    check("alignment", alignment)
+    check("displacement_alignment", displacement_alignment)
     candidates = find_candidates(
         source, target, matches, k=k, refine=refine, articulated=articulated
     )
-    by_icp = (
-        _transform_in_unit(source, target, transform, remove_size) if alignment == "icp" else None
-    )
+    by_icp = None
+    if displacement_alignment == "initial":
+        by_icp = _transform_in_unit(source, target, transform, remove_size)
     # image = R x + t + U Phi c, smoothed by the line after eq. 8 or by elastic iterations
     fixed, elastic = by_icp and (transform, by_icp[3]), refine == "elastic"
     match, moved, attrs = register_surface(

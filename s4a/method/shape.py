@@ -14,7 +14,14 @@ import xarray as xr
 from scipy.spatial import cKDTree
 
 from s4a.geometry import mesh as surface
-from s4a.geometry.align import Cloud, farthest_points, many_farthest_points, rigid_transform
+from s4a.geometry.align import (
+    N_PAIRED,
+    Cloud,
+    cloud,
+    farthest_points,
+    many_farthest_points,
+    rigid_transform,
+)
 from s4a.geometry.closest import Stars, features, interpolation_matrix, stars, tree_over
 from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
 from s4a.method.deform import smoother
@@ -23,7 +30,6 @@ from s4a.method.spectral import Diffusion, project, unit_area, unit_mass
 from s4a.options import N_CENTRAL, N_SAMPLES
 from s4a.schema import Array, require
 
-N_PAIRED = 300  # samples of a shape that rigid alignment pairs
 # of one standard deviation of a field, relative to positions times POSITION_WEIGHT: as much as 2 %
 # of sqrt(area).  With twice the weight, labels of cortex are transferred less accurately
 FIELD_WEIGHT = 0.1
@@ -131,8 +137,9 @@ class Basis:
 
     @cached_property
     def cloud(self) -> Cloud:
-        """The vertices in the form that rigid alignment needs."""
-        return Cloud(self.X, self.area, cKDTree(self.X), self.sample_vertices_of(N_PAIRED))
+        """The vertices in the form that rigid alignment needs; samples have no normals."""
+        normals = self.normals if len(self.T) else None
+        return cloud(self.X, self.area, self.sample_vertices_of(N_PAIRED), normals)
 
     @cached_property
     def tree(self) -> cKDTree:

@@ -11,14 +11,15 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from s4a.geometry.align import RigidTransform, align, realign, relative_transform
+from s4a.geometry.align import RigidTransform, align, relative_transform
 from s4a.method import fmap, network
-from s4a.method.initial_map import (
+from s4a.method.alignment import (
+    align_all,
     alignment_residual,
-    initial_map,
-    map_after_alignment,
+    pair_transform,
     transform_onto,
 )
+from s4a.method.initial_map import initial_map, map_after_alignment
 from s4a.method.latent import (
     DENSE_ITERATIONS,
     consistent_zoomout,
@@ -34,6 +35,7 @@ from s4a.schema import check_count, check_type, dataset, require
 PROJECTION = [name for name, option in DECLARED.items() if option.metadata["of"] == "projection"]
 REGISTRATION = [
     *(name for name, option in DECLARED.items() if option.metadata["of"] == "registration"),
+    "alignment",
     "dense_match",
     *PROJECTION,
 ]
@@ -83,8 +85,8 @@ def align_pair(source: xr.Dataset, target: xr.Dataset) -> xr.Dataset:
     xarray.Dataset
         ``rotation`` R and ``translation`` t of the rigid transform R x + t.  Both shapes are
         centred and scaled to unit area before, so lengths are in multiples of sqrt(area).  The
-        attribute ``residual`` is the trimmed root mean square distance of the nearest-neighbour
-        pairs, in the same unit.
+        attribute ``residual`` is the root mean square distance of the nearest-neighbour pairs in
+        position and weighted normal, in the same unit.
 
     Raises
     ------
@@ -107,7 +109,7 @@ def align_pair(source: xr.Dataset, target: xr.Dataset) -> xr.Dataset:
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     M, N = bases_of({"source": source, "target": target}).values()
-    R, t, residual = align(M.X, M.area, N.X, N.area)
+    R, t, residual = align(M.cloud, N.cloud)
     return dataset({"residual": float(residual)}, rotation=R, translation=t)
 
 
@@ -120,6 +122,7 @@ def map_pairs(
     init: str = "dense",
     initial_refinement: bool = True,
     n_samples: int = N_SAMPLES,
+    alignment: str = "search",
     keep_descriptors: bool = False,
 ) -> xr.Dataset:
     """Compute the initial maps of some pairs, in both directions (4.1, steps 3 and 4).
@@ -137,6 +140,8 @@ def map_pairs(
     n_samples : int
         Farthest-point samples on which that step searches matches if poses are similar; 0 for all
         vertices.
+    alignment : {"search", "icp", "given"}
+        See :class:`s4a.Options`.
     keep_descriptors : bool
         Whether to return the descriptors of the landmarks.
 
@@ -158,7 +163,7 @@ def map_pairs(
     fits: list[xr.Dataset] = []
     for a, b in pairs:
         M, N = bases[a], bases[b]
-        R, t = realign(M.cloud, N.cloud, relative_transform(transforms[a], transforms[b]))
+        R, t = pair_transform(M, N, relative_transform(transforms[a], transforms[b]), alignment)
         R_back, t_back = R.T, -R.T @ t
         forth = initial_map(M, N, (R, t), **options)
         back = map_after_alignment(N, M, (R_back, t_back), **options)
@@ -171,11 +176,12 @@ def map_pairs(
     names = ("source", "target", "fmap_initial", "fmap_fitted", "pair_rotation", "pair_translation")
     *columns, marks = map(np.array, zip(*rows, strict=True))
     maps = dataset(None, **dict(zip((*names, "pair_residual"), columns, strict=True)))
-    if init != "landmarks":
+    if init == "dense":
         return maps
     # marks (p, 2, landmarks)
     marked = dataset(landmark_of_source=marks[:, 0], landmark_of_target=marks[:, 1])
-    return maps.merge(marked).merge(xr.concat(fits, dim="pair"))
+    fitted = xr.concat(fits, dim="pair") if init == "landmarks" else xr.Dataset()
+    return maps.merge(marked).merge(fitted)
 
 
 def build_network(
@@ -186,6 +192,7 @@ def build_network(
     init: str = "dense",
     initial_refinement: bool = True,
     n_samples: int = N_SAMPLES,
+    alignment: str = "search",
 ) -> xr.Dataset:
     """Build the network of initial maps of a collection (3.4, 4.1).
 
@@ -197,13 +204,16 @@ def build_network(
         Number of pairs in the network; all pairs if there are fewer.
     k_init : int
         Size of the initial functional maps.
-    init : {"dense", "landmarks"}
-        Fit initial maps to all nearest neighbours, or to 10 landmarks as in the paper.
+    init : {"dense", "landmarks", "wave_kernels"}
+        Fit initial maps to all nearest neighbours, to 10 landmarks as in the paper, or to wave
+        kernels of the shapes and around these landmarks as in pyFM.
     initial_refinement : bool
         Refine the initial maps by one ZoomOut iteration (4.2).
     n_samples : int
         Number of farthest-point samples for which that iteration searches matches if pose
         differences are small; 0 for all vertices.
+    alignment : {"search", "icp", "given"}
+        Rigid alignment: the best of several results of ICP, plain ICP, or the pose as given.
 
     Returns
     -------
@@ -267,9 +277,9 @@ def build_network(
     k_init = min(k_init, *(basis.k for basis in bases.values()))
     distance = network.spectral_distance([basis.eigenvalue[:k_init] for basis in bases.values()])
     reference = names[int(np.argmin(distance.sum(1)))]
-    N = bases[reference]
-    transforms = {name: transform_onto(M, N) for name, M in bases.items() if name != reference}
-    transforms[reference] = np.eye(3), np.zeros(3)
+    transforms = {
+        name: aligned.transform for name, aligned in align_all(bases, reference, alignment).items()
+    }
     pairs = [(names[i], names[j]) for i, j in network.choose_pairs(distance, n_pairs)]
     maps = map_pairs(
         bases,
@@ -279,9 +289,9 @@ def build_network(
         init=init,
         initial_refinement=initial_refinement,
         n_samples=n_samples,
+        alignment=alignment,
     )
-    residuals = [alignment_residual(bases[name], N, transforms[name]) for name in names]
-    transforms = {name: transforms[name] for name in names}
+    residuals = [alignment_residual(bases[n], bases[reference], transforms[n]) for n in names]
     return with_transforms(maps, transforms, reference, residuals, distance)
 
 
@@ -591,6 +601,7 @@ def register_in(
     template: str,
     target: Shape,
     initial_transform: RigidTransform | None = None,
+    alignment: str = "search",
     **options: Any,
 ) -> xr.Dataset:
     """Register a shape to `target`, the shape of the template; see :func:`register_shape`."""
@@ -600,14 +611,10 @@ def register_in(
     source = shape_in(study, name, **projection)
     bases = latent_bases(study, name, template)
     M, N = source.low, target.low
-    if initial_transform is None:
+    if initial_transform is None and alignment == "search":
         transforms = transform_in(study, name), transform_in(study, template)
         initial_transform = relative_transform(*transforms) if all(transforms) else None
-    transform = (
-        transform_onto(M, N)
-        if initial_transform is None
-        else realign(M.cloud, N.cloud, initial_transform)
-    )
+    transform = transform_onto(M, N, alignment, initial_transform)
     return from_latent(source, target, bases, transform, **options)
 
 
@@ -733,9 +740,10 @@ def register_shape(
         Match by the latent bases (eq. 7), or by functional maps (eq. 3 and 4).  By default as in
         the report of the study.
     **options
-        ``refine``, ``remove_size``, ``articulated``, ``alignment``, ``n_projected`` and
-        ``area_weighted``.  :class:`s4a.Options` describes them.  Options that are missing or None
-        have the values in the report of the study, or their defaults if there is no report.
+        ``refine``, ``remove_size``, ``articulated``, ``alignment``, ``displacement_alignment``,
+        ``n_projected`` and ``area_weighted``.  :class:`s4a.Options` describes them.  Options that
+        are missing or None have the values in the report of the study, or their defaults if there
+        is no report.
 
     Returns
     -------
@@ -796,7 +804,7 @@ def register_shape(
         if value is not None
     }
     options = options_of_registration(study) | given
-    for option in options.keys() & {"refine", "alignment", "dense_match"}:
+    for option in options.keys() & {"refine", "alignment", "displacement_alignment", "dense_match"}:
         check(option, options[option])
     projection = {key: options.pop(key) for key in PROJECTION if key in options}
     template = template_of(study) if template is None else template

@@ -18,17 +18,17 @@ from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.files import SUFFIXES as MESHES
 from s4a.input.files import files_named, suffix_of
 from s4a.input.landmarks import SUFFIXES
-from s4a.input.plausibility import find_warnings
+from s4a.input.plausibility import Flag, Flags, find_warnings
 from s4a.input.subjects import listed
-from s4a.method.initial_map import transform_onto
+from s4a.method.alignment import N_VOTERS, align_onto, less_confident
 from s4a.method.latent import out_of_sample_latent
 from s4a.method.pca import project_scores
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.register import from_latent
 from s4a.method.shape import Shape
-from s4a.method.steps import Study, latent_bases, out_of_sample_basis_in
+from s4a.method.steps import Study, basis_in, latent_bases, out_of_sample_basis_in
 from s4a.options import Options, with_options
-from s4a.schema import check_type, dataset, in_unit, require, unit_of, variable
+from s4a.schema import POSE, check_type, dataset, in_unit, require, unit_of, variable
 from s4a.study.processes import workers
 from s4a.study.sources import find_sources, guides_of_shape
 from s4a.study.tasks import clean_shape
@@ -52,6 +52,7 @@ class Inserted(NamedTuple):
     Y: np.ndarray  # (k, m), latent basis
     registration: xr.Dataset
     comparison: xr.Dataset | None  # None if not compared
+    ambiguity: str  # message on several poses that fit alike
 
 
 def insert(
@@ -192,11 +193,12 @@ def insert(
     if "pca" in study:
         area = vertex_areas(*as_arrays(nodes["registration"]))
         nodes["pca"] = scores_of_new(study["pca"].to_dataset(), nodes["registration"], area)
+    flags = {n: [Flag(POSE, r.ambiguity, True)] for n, r in inserted.items() if r.ambiguity}
     if references is None:
-        nodes["report"] = shape_report(attrs)
+        nodes["report"] = shape_report(attrs, flags)
     else:
         compared = {name: r.comparison for name, r in inserted.items() if r.comparison is not None}
-        nodes["report"] = report_on_new(study, attrs, compared, references)
+        nodes["report"] = report_on_new(study, attrs, compared, references, flags)
     report = nodes["report"].attrs
     report["remarks"] = "\n".join(filter(None, [*remarks, report["remarks"]]))
     # flagged shapes are in the result too
@@ -334,8 +336,13 @@ def _insert_one(mesh, frozen, options, references):
             f"{coarse.sizes['eigenpair']}: give a finer mesh"
         )
     shape = Shape(mesh, coarse, **options.of("projection"))
-    R, t = transform_onto(shape.low, template.low)
     rotation = study["registration"]["rotation"]  # onto the template
+    voters = {
+        name: (basis_in(study, name), (rotation.sel(shape=name).values, np.zeros(3)))
+        for name in names[1 : N_VOTERS + 1]
+    }
+    aligned = align_onto(shape.low, template.low, options.alignment, voters)
+    R, t = aligned.transform
     Y = out_of_sample_basis_in(
         study,
         names,
@@ -347,11 +354,12 @@ def _insert_one(mesh, frozen, options, references):
     )
     settings = {"dense_match": options.dense_match, **options.of("registration")}
     registration = from_latent(shape, template, (Y, of_template), (R, t), **settings)
+    registration = less_confident(registration, len(aligned.fits))
     comparison = None
     if references is not None:
         descriptor = plausibility.describe(mesh, intersections=can_count(options.intersections))
         comparison = plausibility.compare("", descriptor, references)
-    return Inserted(coarse, Y, registration, comparison)
+    return Inserted(coarse, Y, registration, comparison, aligned.ambiguity)
 
 
 def attributes_of(study: xr.DataTree) -> dict[str, dict[Any, Any]]:
@@ -382,6 +390,7 @@ def report_on_new(
     attrs: dict[str, Any],
     comparisons: dict[str, xr.Dataset],
     references: dict[str, xr.Dataset],
+    on_poses: Flags,
 ) -> xr.Dataset:
     """Make the report on the new shapes, each compared with those of the study."""
     in_study = attributes_of(study)
@@ -394,6 +403,7 @@ def report_on_new(
             continue
         new = {name: comparisons[name]}
         flags, lines = find_warnings(in_study | {name: values}, compared | new)
+        flags[name] += on_poses.get(name, [])
         reports.append(shape_report({name: values}, flags, comparisons=new))
         remarks |= dict.fromkeys(line for line in lines if line not in reported_before)
     return xr.concat(reports, dim="shape").assign_attrs(remarks="\n".join(remarks))

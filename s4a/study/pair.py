@@ -9,7 +9,8 @@ from threadpoolctl import threadpool_limits
 
 from s4a.input.collection import Mesh, as_meshes
 from s4a.method import fmap
-from s4a.method.initial_map import alignment_residual, initial_map, transform_onto
+from s4a.method.alignment import align_onto, alignment_residual, less_confident
+from s4a.method.initial_map import initial_map
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.register import refine_at_full_resolution, register
 from s4a.method.shape import Shape
@@ -141,7 +142,8 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     N = target.low
     k = min(options.k, M.k, N.k)
     k_init = min(options.k_init, k)
-    transform = transform_onto(M, N)
+    aligned = align_onto(M, N, options.alignment)
+    transform = aligned.transform
     initial_refinement = options.initial_refinement == "always"
     initial = initial_map(
         M,
@@ -164,6 +166,9 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     registration = register(
         source, target, initial_matches, functions, transform, k=k, **options.of("registration")
     )
+    if aligned.ambiguity:
+        log.warning("%s", aligned.ambiguity)
+    registration = less_confident(registration, len(aligned.fits))
     residual = alignment_residual(M, N, transform)
     maps = dataset(
         fmap=C, fmap_initial=initial.C, fmap_fitted=initial.fitted, icp_residual=residual
@@ -180,4 +185,5 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
             iteration_size=sizes, iteration_fmap=np.stack(padded), iteration_match=matches
         )
         maps = maps.merge(iterations)
-    return registration.assign_attrs(initial_map=initial.name), maps
+    attrs = {"initial_map": initial.name, "ambiguity": aligned.ambiguity}
+    return registration.assign_attrs(attrs), maps

@@ -18,11 +18,12 @@ from s4a.input.chirality import AUTO, mean_chirality, mirrored_shapes, to_reflec
 from s4a.input.collection import remarks_on_files
 from s4a.input.plausibility import Flags
 from s4a.input.subjects import read_table
+from s4a.method.alignment import N_VOTERS
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca_without
 from s4a.method.remesh import check_wrap
 from s4a.options import Options, given_options
-from s4a.schema import dataset
+from s4a.schema import POSE, dataset
 from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
 from s4a.study.processes import limited, temporary_folder
 from s4a.study.quality_control import (
@@ -31,7 +32,9 @@ from s4a.study.quality_control import (
     check_registrations,
     check_usable,
     comparisons_of,
+    exclude_ambiguous,
     exclude_flagged,
+    flag_poses,
     stop_if_flagged,
     unflagged,
 )
@@ -52,6 +55,7 @@ from s4a.study.sources import (
 from s4a.study.store import lock, task_key, write
 from s4a.study.tasks import (
     align_shape,
+    align_voters,
     clean_shape,
     consistent_maps,
     insert_shape,
@@ -222,16 +226,20 @@ def run_steps(
     coarse = remesh(run, original, options)
     flags, coarse, excluded, on_exclusion = exclude_flagged(run, coarse, flags, options)
     coarse, reference, aligned = align(run, coarse, options)
+    flags, coarse, ambiguous, on_poses = exclude_ambiguous(run, coarse, flags, options)
+    stop_if_flagged(flags, options)
     initial = initial_maps(run, coarse, aligned, options)
     latent = consistent_zoomout(run, coarse, initial, options)
-    inserted = insert_excluded(run, excluded, reference, latent, options)
-    registered = register(run, coarse | excluded, inserted, latent, options)
+    moved = align_excluded(run, excluded, reference, options)
+    flags = flag_poses(run, excluded, flags)
+    inserted = insert_excluded(run, moved | ambiguous, excluded | ambiguous, latent, options)
+    registered = register(run, coarse | excluded | ambiguous, inserted, latent, options)
     failed, on_registrations = check_registrations(run, registered, inserted)
     flags = {name: [*flags.get(name, []), *failed.get(name, [])] for name in registered}
     flags = unflagged(flags) if options.quality_control == "off" else flags
-    why_no_modes, flags = modes(run, registered, flags, options)
-    remarks = [*on_chirality, *on_exclusion, *on_shapes, *on_registrations, *remarks]
-    write_report(run, sources, options, remarks, why_no_modes, registered, flags)
+    why_no_modes, flags = modes(run, registered, flags, options, bool(on_poses))
+    remarks = [*on_chirality, *on_exclusion, *on_poses, *on_shapes, *on_registrations, *remarks]
+    write_report(run, sources, options, remarks, why_no_modes, registered, flags, bool(on_poses))
 
 
 def read_and_clean(
@@ -297,6 +305,8 @@ def remesh(run: Run, original: Keys, options: Options) -> Keys:
         settings = (*settings, "refined eigenfunctions")
     if options.method != "rematch":
         settings = (*settings, options.method)
+    if options.sampling != "normals":
+        settings = (*settings, options.sampling)
     todo = [
         Task(
             n,
@@ -335,9 +345,19 @@ def align(run: Run, coarse: Keys, options: Options) -> tuple[Keys, tuple[str, st
     names = list(coarse)
     spectra = lowest_eigenvalues(run, coarse, options.k_init)
     reference = names[int(np.argmin(spectral_distance(spectra).sum(1)))]
-    aligned = task_key(list(coarse.values()), names, reference)
+    aligned = task_key(list(coarse.values()), names, reference, options.alignment)
+    voting = [reference, *(name for name in names if name != reference)][: N_VOTERS + 2]
+    settings = (run.folder, voting, reference, options.alignment)
+    task = Task("voters", "network/voters.nc", align_voters, settings, (aligned,))
+    run.do("align", [task], each=False)
     todo = [
-        Task(n, f"network/alignment_{n}.nc", align_shape, (run.folder, n, reference), (aligned, n))
+        Task(
+            n,
+            f"network/alignment_{n}.nc",
+            align_shape,
+            (run.folder, n, reference, options.alignment),
+            (aligned, n),
+        )
         for n in names
     ]
     moved = {name: coarse[name] for name in run.do("align", todo)}
@@ -420,13 +440,8 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
     return key
 
 
-def insert_excluded(
-    run: Run, excluded: Keys, reference: tuple[str, str], latent: str, options: Options
-) -> Keys:
-    """Insert the shapes that are excluded from the network (eq. 3): ``/latent/<shape>``.
-
-    Each shape is aligned to the reference and mapped to some shapes of the network; its latent
-    basis is solved for with their bases fixed.
+def align_excluded(run: Run, excluded: Keys, reference: tuple[str, str], options: Options) -> Keys:
+    """Align the shapes that are excluded from the network to the reference.
 
     Parameters
     ----------
@@ -437,11 +452,28 @@ def insert_excluded(
     name, reference_key = reference
     todo = [
         Task(
-            n, f"network/alignment_{n}.nc", align_shape, (run.folder, n, name), (reference_key, key)
+            n,
+            f"network/alignment_{n}.nc",
+            align_shape,
+            (run.folder, n, name, options.alignment),
+            (reference_key, key, options.alignment),
         )
         for n, key in excluded.items()
     ]
-    aligned = run.do("align flagged shapes", todo) if excluded else {}
+    return run.do("align flagged shapes", todo) if excluded else {}
+
+
+def insert_excluded(run: Run, aligned: Keys, excluded: Keys, latent: str, options: Options) -> Keys:
+    """Insert the shapes that are excluded from the network (eq. 3): ``/latent/<shape>``.
+
+    Each shape is mapped to some shapes of the network; its latent basis is solved for with their
+    bases fixed.
+
+    Parameters
+    ----------
+    aligned, excluded : dict of str to str
+        Keys of the alignments and of the low-resolution meshes.
+    """
     settings = (options.k_init, options.of("initial maps"), options.step, options.norm)
     todo = [
         Task(
@@ -461,7 +493,8 @@ def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Optio
     """Register every shape to the template, the median shape by default (4.2, eq. 6 to 8)."""
     template = options.template or attributes(run.folder / "latent.nc")["median"]
     projection = (options.area_weighted, options.n_projected)
-    settings = (template, options.dense_match, options.of("registration"), projection)
+    registration = {"alignment": options.alignment, **options.of("registration")}
+    settings = (template, options.dense_match, registration, projection)
     template_key = task_key(latent, settings)
     mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
     if inserted:
@@ -492,8 +525,13 @@ def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Optio
     return registered
 
 
-def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> tuple[str, Flags]:
+def modes(
+    run: Run, registered: Keys, flags: Flags, options: Options, ambiguous: bool = False
+) -> tuple[str, Flags]:
     """Compute the modes of variation (6.1), ``/pca``.
+
+    Flagged shapes are excluded; their scores are computed along the modes of the others.  With
+    `ambiguous`, shapes whose pose alone is ambiguous are included.
 
     Returns
     -------
@@ -501,8 +539,6 @@ def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> tuple[s
         The reason if there are none.
     flags : dict of str to list of Flag
         Flags of the registered shapes, with the warnings of :func:`check_modes`.
-
-    Flagged shapes are excluded; their scores are computed along the modes of the others.
     """
     with run.stage("modes"):
         mesh = read(run.folder / "registration.nc")
@@ -512,7 +548,8 @@ def modes(run: Run, registered: Keys, flags: Flags, options: Options) -> tuple[s
         excluded = [
             name
             for name in registered
-            if name != template and any(flag.flagged for flag in flags[name])
+            if name != template
+            and any(flag.flagged and not (ambiguous and flag.kind == POSE) for flag in flags[name])
         ]
         excluded = [] if options.include_flagged else excluded
         coarse = read(run.folder / f"coarse/{template}.nc")

@@ -4,7 +4,7 @@ Shapes are compared with their collection before the computation, checked by the
 eigenfunctions, and in the end by their registration.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import xarray as xr
@@ -12,8 +12,16 @@ from scipy import stats
 from scipy.spatial.distance import pdist, squareform
 
 from s4a.geometry.crossing import can_count
-from s4a.input.plausibility import Flags, find_warnings, flag, flagged_lines, pick_references
+from s4a.input.plausibility import (
+    Flag,
+    Flags,
+    find_warnings,
+    flag,
+    flagged_lines,
+    pick_references,
+)
 from s4a.options import Options
+from s4a.schema import POSE
 from s4a.study.netcdf import arrays, attributes, open_file, read
 from s4a.study.runner import Keys, Run, Task
 from s4a.study.store import task_key
@@ -160,6 +168,40 @@ def exclude_flagged(
     excluded = {n: coarse[n] for n in coarse if n not in trusted and count[n] >= k}
     check_usable(run, network, options)
     return flags, network, excluded, remarks
+
+
+def flag_poses(run: Run, aligned: Iterable[str], flags: Flags) -> Flags:
+    """Add flags to the shapes that fit the others alike in several poses."""
+    found = {n: attributes(run.folder / f"network/alignment_{n}.nc")["ambiguity"] for n in aligned}
+    new = {name: [Flag(POSE, words, True)] for name, words in found.items() if words}
+    return flags | {name: [*flags.get(name, []), *new[name]] for name in new}
+
+
+def exclude_ambiguous(
+    run: Run, coarse: Keys, flags: Flags, options: Options
+) -> tuple[Flags, Keys, Keys, list[str]]:
+    """Split the shapes of the network into those with one pose and ambiguous ones.
+
+    If half of the shapes or more are ambiguous, none is excluded, nor with
+    ``quality_control="off"``.
+
+    Returns
+    -------
+    flags, coarse, excluded, remarks : see :func:`exclude_flagged`
+    """
+    flags = flag_poses(run, coarse, flags)
+    if options.quality_control == "off":
+        return unflagged(flags), coarse, {}, []
+    ambiguous = [n for n in coarse if any(flag.kind == POSE for flag in flags.get(n, []))]
+    excluded = {n: coarse[n] for n in ambiguous if n != options.template}
+    if 2 * len(excluded) >= len(coarse):
+        remark = (
+            f"{len(ambiguous)} of {len(coarse)} shapes fit the others alike in several poses, too "
+            "many to exclude them; all are used, some perhaps in the wrong pose: give landmarks=, "
+            "or alignment='given' if the files are aligned"
+        )
+        return flags, coarse, {}, [remark]
+    return flags, {n: coarse[n] for n in coarse if n not in excluded}, excluded, []
 
 
 def unflagged(flags: Flags) -> Flags:

@@ -25,6 +25,7 @@ def write_report(
     no_modes: str,
     registered: dict[str, str],
     flags: Flags,
+    ambiguous: bool = False,
 ) -> None:
     """Write ``/report``: every shape, warnings, reduced options, costs and options.
 
@@ -42,6 +43,8 @@ def write_report(
         Keys of the registrations.
     flags : dict of str to list of Flag
         Flags of the registered shapes.
+    ambiguous : bool
+        Whether shapes with an ambiguous pose are in the modes.
     """
     names = list(registered)
     template = attributes(run.folder / "registration.nc")["template"]
@@ -63,7 +66,10 @@ def write_report(
         report = report.assign(chirality_evidence(run, list(sources), options).variables)
     report = report.assign(costs(run).variables)
     report = report.assign_attrs(
-        with_options({"template": template, "no_modes": no_modes}, vars(options))
+        with_options(
+            {"template": template, "no_modes": no_modes, "ambiguous_included": int(ambiguous)},
+            vars(options),
+        )
     )
     report.attrs["unforeseen"] = " ".join(run.unforeseen)  # names of shapes, which have no blanks
     template_row = report.sel(shape=template)

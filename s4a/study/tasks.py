@@ -21,7 +21,7 @@ from s4a.input.collection import read_shape
 from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.landmarks import guides_of, with_landmarks
 from s4a.method import steps
-from s4a.method.initial_map import alignment_residual, transform_onto
+from s4a.method.alignment import align_voted, alignment_residual, less_confident, voters_of
 from s4a.method.latent import out_of_sample_latent
 from s4a.method.network import spectral_distance
 from s4a.method.refined_eigenfunctions import low_resolution
@@ -145,15 +145,30 @@ def template_of(folder: Path, name: str, options: Options) -> Shape:
     return last_template.setdefault(key, shape)
 
 
-def align_shape(folder: Path, name: str, reference: str) -> xr.Dataset:
+def align_voters(folder: Path, names: list[str], reference: str, alignment: str) -> xr.Dataset:
+    """Compute the rigid transforms of the shapes that vote on the poses of all (4.1, step 2)."""
+    bases = {name: steps.basis_in(Folder(folder), name) for name in names}
+    voters = voters_of(bases, reference, alignment)
+    R, t = (
+        np.array([pose[i] for _, pose in voters.values()]).reshape(-1, *shape)
+        for i, shape in enumerate([(3, 3), (3,)])
+    )
+    return dataset(None, rotation=R, translation=t).assign_coords(shape=list(voters))
+
+
+def align_shape(folder: Path, name: str, reference: str, alignment: str) -> xr.Dataset:
     """Compute the rigid transform of a shape onto the reference, of unit area (4.1, step 2)."""
-    R, t, residual = np.eye(3), np.zeros(3), 0.0
-    if name != reference:
-        M, N = (steps.basis_in(Folder(folder), n) for n in (name, reference))
-        R, t = transform_onto(M, N)
-        residual = alignment_residual(M, N, (R, t))
+    study = Folder(folder)
+    poses = study["network/voters"]
+    rows = zip(*(poses[key].values for key in ("shape", "rotation", "translation")), strict=True)
+    voters = {str(n): (steps.basis_in(study, n), (R, t)) for n, R, t in rows}
+    target = steps.basis_in(study, reference)
+    basis = target if name == reference else steps.basis_in(study, name)
+    found = align_voted(name, basis, target, reference, alignment, voters)
+    residual = alignment_residual(basis, target, found.transform)
     attrs: dict[str, Any] = {"reference": reference, "residual": residual}
-    return dataset(attrs, rotation=R, translation=t)
+    attrs |= {"n_poses": len(found.fits), "ambiguity": found.ambiguity}
+    return dataset(attrs, rotation=found.R, translation=found.t)
 
 
 def map_pairs(
@@ -224,4 +239,7 @@ def register_shape(folder: Path, name: str, template: str, options: Options) -> 
     """Register a shape to the template: eq. 6 at low resolution, then eq. 7 or eq. 3 and 4."""
     target = template_of(folder, template, options)
     settings = {"dense_match": options.dense_match, **options.of("registration")}
-    return steps.register_in(Folder(folder), name, template, target, **settings)
+    settings["alignment"] = options.alignment
+    study = Folder(folder)
+    n_poses = study[f"network/alignment_{name}"].attrs["n_poses"]
+    return less_confident(steps.register_in(study, name, template, target, **settings), n_poses)

@@ -9,7 +9,7 @@ import xarray as xr
 
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.options import kept_options
-from s4a.schema import INPUT, in_unit, unit_of, variable
+from s4a.schema import INPUT, POSE, in_unit, unit_of, variable
 from s4a.study.contents import check_contents, check_fit, check_name
 from s4a.study.netcdf import DamagedError, damage_named, open_file, read, read_tree, stacked
 from s4a.study.store import check_is_study, write
@@ -263,7 +263,10 @@ def left_out(study: xr.DataTree) -> list[str]:
     if "status" not in report or kept_options(report).get("include_flagged"):
         return []
     template = study["registration"].attrs.get("template")
-    flagged = report["shape"].values[report["status"].values == "flagged"].tolist()
+    is_flagged = report["status"].values == "flagged"
+    if report.attrs.get("ambiguous_included"):
+        is_flagged &= report["flag_kinds"].values != POSE
+    flagged = report["shape"].values[is_flagged].tolist()
     return [name for name in flagged if name != template]
 
 

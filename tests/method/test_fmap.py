@@ -6,7 +6,7 @@ from paths import DATA
 from scipy.spatial import cKDTree
 
 from s4a import clean, coarsen, spectrum, synthetic
-from s4a.geometry.align import align, farthest_points
+from s4a.geometry.align import align, cloud, farthest_points
 from s4a.geometry.mesh import as_dataset
 from s4a.method import fmap, spectral
 from s4a.method.nearest import nearest_rows
@@ -191,7 +191,7 @@ def test_zoomout_is_that_of_pyfm_to_the_last_index(name):
         (mesh["position"].values, mesh["eigenfunction"].values, spectral.unit_area(mesh))
         for mesh in (source, target)
     )
-    R, t, _ = align(M, area_source, N, area)
+    R, t, _ = align(cloud(M, area_source), cloud(N, area))
     C = fmap.fmap_from_match(Phi[:, :20], Psi[:, :20], area, cKDTree(M @ R.T + t).query(N)[1])
     peer, their_match = refine.zoomout_refine(
         C, Phi, Psi, nit=8, step=5, A2=area, return_p2p=True, n_jobs=1

@@ -27,7 +27,7 @@ from s4a.input.annotations import write_landmarks
 from s4a.input.chirality import mirror_image
 from s4a.input.files import files_named
 from s4a.input.landmarks import SUFFIXES
-from s4a.method.initial_map import transform_onto
+from s4a.method.alignment import transform_onto
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.shape import Shape
 from s4a.schema import dataset
@@ -218,12 +218,25 @@ def test_landmarks_of_a_mirrored_shape_lie_where_they_lay(marked):
     np.testing.assert_allclose(image["guide_position"], mesh["guide_position"] * [-1, 1, 1])
 
 
-def test_landmarks_without_elastic_rounds_are_refused(marked):
+@pytest.mark.parametrize("preset", ["paper", None])
+def test_landmarks_decide_the_pose_with_every_preset(marked, preset):
     meshes, folder = marked
-    with pytest.raises(
-        ValueError, match="landmarks guide elastic iterations, and refine='spectral_icp'"
-    ):
-        analyse(meshes, landmarks=folder, refine="spectral_icp")
+    turn = np.diag([-1.0, -1.0, 1.0])
+    given = {}
+    for name in list(meshes)[:3]:
+        mesh, rotation = with_landmarks(meshes[name], folder / f"{name}.csv"), np.eye(3)
+        if name == "brain_02":
+            rotation = turn
+        for key in ("position", "guide_position"):
+            mesh[key] = mesh[key].copy(data=mesh[key].values @ rotation)
+        given[name] = mesh
+    small = {"n_coarse": 200, "k": 20, "k_init": 10, "intersections": False}
+    small |= {} if preset else {"n_samples": 150}
+    study = analyse(given, preset=preset, **small)
+    R = study["registration"]["rotation"]
+    others = [R.sel(shape=name).values for name in ("brain_01", "brain_03")]
+    for rotation in others:  # the rotation of brain_02 without the turn is near the others
+        assert np.trace(R.sel(shape="brain_02").values @ turn @ rotation.T) > 2.8
 
 
 def test_the_command_line_takes_them_for_a_study_and_for_new_shapes(marked, tmp_path, capsys):

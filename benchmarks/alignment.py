@@ -1,0 +1,288 @@
+"""Rigid alignment: accuracy, ambiguous poses, and results of rotated files.
+
+``alignment.py accuracy``: degrees between the rigid transform that each ``alignment=`` finds and
+that of the ground truth (corresponding vertices, or landmarks), for all pairs of some shapes.
+
+``alignment.py ambiguous [COLLECTION ...]``: shapes that are flagged with an ambiguous pose: false
+positives in real collections, and nearly symmetric rods, discs and tori.
+
+``alignment.py rotations [COLLECTION ...]``: an analysis of the files as they are, and ten of files
+that are rotated at random: share of equal matches, and differences of the variance ratios.
+
+``alignment.py femurs``: 16 femurs that are not aligned: rotations, and landmark errors after
+``s4a.analyse`` and after rigid ICP.
+
+``alignment.py modes``: simulated modes that are found with the preset of the paper, by alignment.
+
+The real collections are in the shared data beside the checkout.
+"""
+
+import itertools
+import json
+import logging
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+import s4a
+from s4a.geometry.align import rigid_transform
+from s4a.geometry.mesh import as_arrays
+from s4a.input.labels import read_volume
+from s4a.method.alignment import align_all, transform_onto
+from s4a.method.shape import Shape
+from s4a.options import PRESETS
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+ALIGNMENTS = ("search", "icp", "given")
+SMALL = {"n_coarse": 300, "k": 30, "n_samples": 300, "intersections": False}
+CLEAN = ("heads", "skulls", "faces", "faust_r", "kids", "hippocampi", "femurs", "femurs_sicas")
+CLEAN = (*CLEAN, "spleens", "vertebrae", "brains")
+SYMMETRIC = ("rods, bump 30 %", "rods, bump 10 %", "thin rods", "discs", "plain rods", "tori")
+ROTATED = {"hippocampi": 5, "tori": 4, "femurs_sicas": 4, "faces": 3, "heads": 2}
+
+
+def say(*cells):
+    """Print a row of a table in Markdown."""
+    sys.stdout.write("| " + " | ".join(map(str, cells)) + " |\n")
+    sys.stdout.flush()
+
+
+def title(*cells):
+    """Print the head of a table."""
+    say(*cells)
+    say(*["---"] * len(cells))
+
+
+def collection(name, most=40):
+    """Return the meshes of a collection by name."""
+    if name in SYMMETRIC:
+        return dict(itertools.islice(simulated(name), most))
+    if name == "brains":
+        tree = s4a.synthetic.brains(min(most, 12), 4000)["original"].children
+        return {shape: node.to_dataset() for shape, node in tree.items()}
+    if name == "hippocampi":
+        files = sorted((DATA / "hippocampi_msd").glob("*.nii.gz"))[:most]
+        volumes = {file.name.partition(".")[0]: read_volume(file, "all")[:2] for file in files}
+        return cleaned({shape: (X - X.mean(0), T) for shape, (X, T) in volumes.items()})
+    with tempfile.TemporaryDirectory() as folder:
+        unpack = [sys.executable, DATA / "unpack.py", folder, name]
+        subprocess.run(unpack, check=True, stdout=subprocess.DEVNULL)
+        files = sorted(Path(folder, name).glob("*.ply"))[:most]
+        return {file.stem: s4a.read_shape(file) for file in files}
+
+
+def cleaned(arrays):
+    """Return clean meshes of points and triangles."""
+    tree = s4a.read_shapes(arrays, compare=False)["original"].children
+    return {name: node.to_dataset() for name, node in tree.items()}
+
+
+def simulated(name):
+    """Yield nearly symmetric shapes with names, each with its own proportions."""
+    options = {
+        "rods, bump 30 %": (0.3, (60, 12, 10)),
+        "rods, bump 10 %": (0.1, (60, 12, 10)),
+        "thin rods": (0.2, (200, 12, 10)),
+        "discs": (0.15, (20, 50, 48)),
+        "plain rods": (0.0, (60, 12, 10)),
+    }
+    for seed in range(5):
+        mesh = torus(seed) if name == "tori" else bumpy(seed, *options[name])
+        yield from cleaned({f"shape_{seed}": mesh}).items()
+
+
+def bumpy(seed, bump, axes):
+    """Return an ellipsoid with one bump and own proportions."""
+    rng = np.random.default_rng(seed)
+    U, T = as_arrays(s4a.synthetic.sphere(2000))
+    half = np.array(axes)[[2, 1, 0]] * (1 + 0.06 * rng.standard_normal(3))
+    place = np.array([0.3, 1, 0.8]) / np.linalg.norm([0.3, 1, 0.8])
+    height = bump * (1 + 0.1 * rng.standard_normal())
+    X = U * half * (1 + height * np.exp(-((U - place) ** 2).sum(1) / 0.15))[:, None]
+    return X, T
+
+
+def torus(seed, n=(90, 40)):
+    """Return a torus with own radii along the angle u, all in one pose."""
+    u, v = np.meshgrid(*(np.arange(k) * 2 * np.pi / k for k in n), indexing="ij")
+    a, b, c = np.random.default_rng(seed).normal(0, 0.12, 3)
+    r = 0.35 * (1 + 0.35 * np.cos(u) + a * np.cos(2 * u) + b * np.sin(u))
+    R = 1 + 0.25 * np.cos(u + 0.3) + c * np.sin(2 * u) + r * np.cos(v)
+    X = np.stack([R * np.cos(u), 1.2 * R * np.sin(u), r * np.sin(v) + 0.15 * np.sin(u)], axis=-1)
+    i, j = (index.ravel() for index in np.indices(n))
+    vertex = lambda i, j: (i % n[0]) * n[1] + j % n[1]  # noqa: E731
+    corner = [vertex(i, j), vertex(i + 1, j), vertex(i + 1, j + 1), vertex(i, j + 1)]
+    T = np.concatenate(
+        [np.stack([corner[k] for k in part], axis=1) for part in ((0, 1, 2), (0, 2, 3))]
+    )
+    return X.reshape(-1, 3), T
+
+
+def low_of(mesh, n_coarse=500):
+    """Return the low resolution of a mesh in its frame, without eigenfunctions to speak of."""
+    return Shape(coarse=s4a.spectrum(s4a.coarsen(mesh, n_coarse=n_coarse), k=4))
+
+
+def degrees(R, S):
+    """Angle between two rotations."""
+    return np.rad2deg(Rotation.from_matrix(R @ S.T).magnitude())
+
+
+def ambiguous(names):
+    """Print how many shapes of each collection are flagged."""
+    title("collection", "shapes", "flagged", "residual", "rotated by more than 45 degrees")
+    for name in names or (*CLEAN, *SYMMETRIC):
+        bases = {shape: low_of(mesh).low for shape, mesh in collection(name).items()}
+        found = align_all(bases, next(iter(bases)))
+        flagged = sum(bool(aligned.ambiguity) for aligned in found.values())
+        rotated = sum(degrees(aligned.R, np.eye(3)) > 45 for aligned in found.values())
+        residual = np.median([aligned.fits[0] for aligned in found.values()])
+        say(name, len(bases), flagged, f"{residual:.3f}", rotated)
+
+
+def corresponding():
+    """Yield collections: name, and points of each shape that correspond, by name."""
+    tree = s4a.synthetic.brains(7, 10_000, seed=0)
+    at = tree["truth/brain_01/reference_point"].values[::5]
+    meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
+    points = {name: s4a.synthetic.position(tree["truth"], name, at) for name in meshes}
+    yield "brains", meshes, {name: np.asarray(values) for name, values in points.items()}
+    meshes = collection("faces", 8)
+    yield "faces", meshes, {name: mesh["position"].values[::5] for name, mesh in meshes.items()}
+    yield "femurs", *marked("femurs_sicas")
+    yield "skulls", *marked("skulls")
+    meshes = collection("heads", 6)
+    yield "heads", meshes, {}
+
+
+def marked(name):
+    """Return meshes, and their landmarks (n, 3)."""
+    meshes, points = collection(name, 8), {}
+    folder = DATA / {"skulls": "mouse_skulls"}.get(name, name)
+    for shape in meshes:
+        file = next(folder.glob(f"{shape}*.json"))
+        points[shape] = landmarks_of(file)
+    return meshes, points
+
+
+def landmarks_of(file):
+    """Read landmarks of Scalismo's JSON or of a Slicer file, in RAS."""
+    marks = json.loads(file.read_text(encoding="utf-8"))
+    if isinstance(marks, list):
+        return np.array([mark["coordinates"] for mark in marks])
+    marks = marks["markups"][0]["controlPoints"]
+    return np.array([mark["position"] for mark in marks])
+
+
+def accuracy():
+    """Print the error of the rotation by alignment, over all pairs."""
+    title("collection", "pairs", *(f"{name}: mean (max)" for name in ALIGNMENTS))
+    for name, meshes, points in corresponding():
+        shapes = {shape: low_of(mesh, 2000) for shape, mesh in meshes.items()}
+        errors = {alignment: [] for alignment in ALIGNMENTS}
+        for a, b in itertools.combinations(meshes, 2):
+            M, N = shapes[a], shapes[b]
+            true = np.eye(3)
+            if points:
+                true = rigid_transform(M.to_frame(points[a]), N.to_frame(points[b]))[0]
+            for alignment, values in errors.items():
+                R, _ = transform_onto(M.low, N.low, alignment)
+                values.append(degrees(R, true))
+        cells = [f"{np.mean(values):.2f} ({np.max(values):.1f})" for values in errors.values()]
+        say(name, len(values), *cells)
+
+
+def rotated(meshes, seed):
+    """Return points and triangles in single precision, rotated at random unless the seed is 0."""
+    found = {}
+    for i, (name, mesh) in enumerate(meshes.items()):
+        X, T = as_arrays(mesh)
+        Q = Rotation.random(random_state=100 * seed + i).as_matrix() if seed else np.eye(3)
+        found[name] = (X @ Q.T).astype(np.float32).astype(float), T
+    return found
+
+
+def rotations(names):
+    """Print the differences between studies of rotated files and that of the files as they are."""
+    title("collection", "shapes", "equal matches, least of a shape", "variance ratio, most")
+    for name in names or ROTATED:
+        meshes = collection(name, ROTATED.get(name, 5))
+        first, *others = (s4a.analyse(rotated(meshes, seed), **SMALL) for seed in range(11))
+        match, ratio = (
+            [study[node][key].values for study in (first, *others)]
+            for node, key in (
+                ("registration", "registered_match"),
+                ("pca", "explained_variance_ratio"),
+            )
+        )
+        equal = min(
+            (match[0] == m).mean(1).min() if m.shape == match[0].shape else 0 for m in match
+        )
+        most = max(np.abs(ratio[0] - r).max() if len(r) == len(ratio[0]) else 1 for r in ratio)
+        say(name, len(meshes), f"{100 * equal:.2f} %", f"{most:.0e}")
+
+
+def femurs(n_coarse=2000):
+    """Print rotations and landmark errors of femurs after registration, and after rigid ICP."""
+    meshes = collection("femurs_sicas")
+    marks = {name: landmarks_of(DATA / "femurs_sicas" / f"{name}.json") for name in meshes}
+    study = s4a.analyse(meshes, n_coarse=n_coarse, intersections=False)
+    registration, report = study["registration"], study["report"]
+    template = registration.attrs["template"]
+    X = registration["position"].values
+    at = cKDTree(X).query(marks[template])[1]  # vertices of the template
+    low = {name: low_of(mesh, n_coarse) for name, mesh in meshes.items()}
+    title("femur", "status", "rotation, degrees off", "error after analyse", "after rigid ICP")
+    errors = []
+    for name in meshes:
+        if name == template:
+            continue
+        one = registration.sel(shape=name)
+        R, t = one["rotation"].values, one["translation"].values
+        image = X + one["displacement"].values
+        moved = marks[name] @ R.T + t
+        after = np.linalg.norm(image[at] - moved, axis=1).mean()
+        true = rigid_transform(marks[name], marks[template])[0]
+        M, N = low[name], low[template]
+        S, u = transform_onto(M.low, N.low)
+        icp = (M.to_frame(marks[name]) * M.frame[1] / N.frame[1]) @ S.T + u
+        rigid = np.linalg.norm(N.from_frame(icp) - marks[template], axis=1).mean()
+        errors.append((after, rigid))
+        status = report["status"].sel(shape=name).item()
+        say(name, status, f"{degrees(R, true):.1f}", f"{after:.2f} mm", f"{rigid:.2f} mm")
+    say("mean", "", "", *(f"{value:.2f} mm" for value in np.mean(errors, axis=0)))
+
+
+def modes():
+    """Print |correlation| of scores and simulated scores of the brains, and displacement errors."""
+    tree = s4a.synthetic.brains(8, 4000, seed=0)
+    meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
+    truth = tree["truth"]["true_score"].values  # (shape, mode)
+    title("options", "best |correlation| of each simulated mode", "variance ratios")
+    paper = PRESETS["paper"]
+    rows = {f"paper, {name}": paper | {"alignment": name} for name in ALIGNMENTS}
+    rows |= {f"default, {name}": {"alignment": name} for name in ALIGNMENTS}
+    for name, options in rows.items():
+        study = s4a.analyse(meshes, **{**options, "n_coarse": 1000, "k": 60}, template="brain_01")
+        score = study["pca"]["score"].values
+        both = np.corrcoef(score.T, truth.T)[: score.shape[1], score.shape[1] :]
+        ratio = study["pca"]["explained_variance_ratio"].values[:3]
+        say(name, *(" ".join(f"{v:.2f}" for v in row) for row in (np.abs(both).max(0), ratio)))
+
+
+if __name__ == "__main__":
+    logging.disable(logging.WARNING)
+    what, *names = sys.argv[1:] or [""]
+    actions = {"accuracy": accuracy, "femurs": femurs, "modes": modes}
+    lists = {"ambiguous": ambiguous, "rotations": rotations}
+    if what in lists:
+        lists[what](names)
+    elif what in actions:
+        actions[what]()
+    else:
+        sys.exit(__doc__)

@@ -1,0 +1,227 @@
+"""Rigid alignment of the shapes (4.1, step 2), and poses that fit alike.
+
+A pose of a shape is a rigid transform onto the reference.  Several are found by ICP from the
+principal axes.  Other shapes, which have a pose of their own, vote: the pose that fits the
+reference and all of them best is used, so that it closes the cycles of the network.
+"""
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from scipy.spatial import cKDTree
+
+from s4a.geometry.align import (
+    N_POSES,
+    ROUGH,
+    RigidTransform,
+    icp,
+    icp_each,
+    point_to_point,
+    poses,
+    realign,
+    relative_transform,
+    residual_of,
+    rigid_transform,
+)
+from s4a.input.plausibility import flag
+from s4a.method import spectral_icp
+from s4a.method.shape import Basis, corresponding_landmarks
+from s4a.options import check
+
+N_VOTERS = 6
+# of sqrt(area): poses fit alike if the root of the difference of their mean squared residuals is
+# below it; the shapes of a collection differ from each other by about 0.04.  With fewer vertices
+# than ENOUGH their spacing hides part of the difference
+ALIKE, ENOUGH = 0.023, 500
+_COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
+IDENTITY = np.eye(3), np.zeros(3)
+
+
+class Alignment(NamedTuple):
+    """Rigid transform of a shape onto a reference, and the poses that fit alike."""
+
+    R: np.ndarray  # (3, 3)
+    t: np.ndarray  # (3,)
+    fits: tuple[float, ...] = (0.0,)  # residuals of the poses that fit alike, the best first
+    angle: float = 0.0  # degrees between the best and the second of them
+
+    @property
+    def transform(self) -> RigidTransform:
+        """The transform (R, t)."""
+        return self.R, self.t
+
+    @property
+    def ambiguity(self) -> str:
+        """Message on poses that fit alike; empty if there is only one."""
+        if len(self.fits) < 2:
+            return ""
+        best, second, *_ = self.fits
+        values = {"number": len(self.fits), "best": best, "second": second, "angle": self.angle}
+        return flag("pose", **values).words
+
+
+def less_confident(registration: xr.Dataset, n_poses: int) -> xr.Dataset:
+    """Divide the confidence of a registration by the number of poses that fit alike."""
+    confidence = registration["confidence"]
+    return registration.assign(confidence=confidence.copy(data=confidence.values / n_poses))
+
+
+Voters = Mapping[str, tuple[Basis, RigidTransform]]  # name -> shape, and its pose
+
+
+def transform_onto(
+    source: Basis,
+    target: Basis,
+    alignment: str = "search",
+    start: RigidTransform | None = None,
+) -> RigidTransform:
+    """Return the rigid transform (R, t) of the source onto the target (4.1, step 2).
+
+    Parameters
+    ----------
+    source, target : Basis
+    alignment : {"search", "icp", "given"}
+        The best of several results of ICP; plain ICP from the pose of the files, or that pose with
+        centroids aligned.
+    start : tuple (R, t), optional
+        Approximate transform, from which alone ICP starts.  Three or more common landmarks that are
+        not collinear replace it.
+    """
+    check("alignment", alignment)
+    if alignment == "given":
+        return start or IDENTITY
+    start = from_landmarks(source, target) or start
+    if alignment == "icp":
+        return point_to_point(source.cloud, target.cloud, *(start or IDENTITY))[:2]
+    if start is None:
+        return poses(source.cloud, target.cloud)[0][:2]
+    return realign(source.cloud, target.cloud, start)
+
+
+def from_landmarks(source: Basis, target: Basis) -> RigidTransform | None:
+    """Return the transform that fits common landmarks; None if they do not determine it."""
+    at_source, at_target = corresponding_landmarks(source, target)
+    P = source.X[at_source]
+    if len(P) < 3 or np.linalg.svd(P - P.mean(0), compute_uv=False)[1] < _COLLINEAR:
+        return None
+    R, t, _ = rigid_transform(P, target.X[at_target])
+    return R, t
+
+
+def pair_transform(
+    source: Basis, target: Basis, start: RigidTransform, alignment: str
+) -> RigidTransform:
+    """Return the transform of a pair of the network, whose poses give the transform `start`."""
+    if alignment == "search":
+        return realign(source.cloud, target.cloud, start)
+    return transform_onto(source, target, alignment)
+
+
+def alignment_residual(source: Basis, target: Basis, transform: RigidTransform) -> float:
+    """Root mean square distance of nearest vertices, in both directions, after a transform."""
+    X, Y = (
+        basis.cloud._replace(normals=None, tree=cKDTree(basis.X)) for basis in (source, target)
+    )
+    return residual_of(icp(X, Y, *transform, iterations=1))
+
+
+def align_onto(
+    source: Basis, target: Basis, alignment: str = "search", voters: Voters | None = None
+) -> Alignment:
+    """Align a shape to a reference, and find the poses that fit alike.
+
+    Parameters
+    ----------
+    source, target, alignment : see :func:`transform_onto`
+    voters : dict, optional
+        Other shapes, with their poses on the target.
+
+    Returns
+    -------
+    Alignment
+        With one pose only if landmarks, ICP from one start or the pose of the files decide, or if
+        shapes are so different that rigid alignment decides nothing (:func:`poses_differ`).
+    """
+    if alignment != "search" or from_landmarks(source, target):
+        return Alignment(*transform_onto(source, target, alignment))
+    found = [(R, t) for R, t, _ in poses(source.cloud, target.cloud)[:N_POSES]]
+    return elect(source, {"": (target, IDENTITY), **(voters or {})}, found)
+
+
+def ambiguity_of_reference(target: Basis, voters: Voters) -> Alignment:
+    """Find the poses of the reference itself that fit the other shapes alike."""
+    other, onto = next(iter(voters.values()))
+    if from_landmarks(target, other):
+        return Alignment(*IDENTITY)
+    found = [_after((R, t), onto) for R, t, _ in poses(target.cloud, other.cloud)[:N_POSES]]
+    return elect(target, voters, found)._replace(R=np.eye(3), t=np.zeros(3))
+
+
+def _after(first: RigidTransform, second: RigidTransform) -> RigidTransform:
+    (R, t), (S, u) = first, second
+    return S @ R, S @ t + u
+
+
+def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Alignment:
+    """Choose the pose with the least mean squared residual to the voters."""
+    squared = np.zeros(len(found))
+    for other, onto in voters.values():
+        starts = [relative_transform(pose, onto) for pose in found]
+        ends = icp_each(source.cloud, other.cloud, starts, tolerance=5 * ROUGH)
+        squared += np.array([residual for *_, residual in ends]) ** 2 / len(voters)
+    order = np.argsort(squared, kind="stable")
+    limit = ALIKE**2 * min(1.0, len(source.X) / ENOUGH)
+    best, alike = order[0], squared[order] - squared.min() < limit
+    R, t = found[best]
+    fits = tuple(np.sqrt(squared[order[alike]]).tolist())
+    if len(fits) < 2 or _differs(source, voters, (R, t)):
+        return Alignment(R, t, fits[:1])
+    cosine = (np.trace(R.T @ found[order[1]][0]) - 1) / 2
+    return Alignment(R, t, fits, float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))))
+
+
+def _differs(source: Basis, voters: Voters, pose: RigidTransform) -> bool:
+    """Return whether the shape is in another pose of its parts than most voters."""
+    count = 0
+    for other, onto in voters.values():
+        R, t = relative_transform(pose, onto)
+        near = cKDTree(source.X @ R.T + t).query(other.X)[1]
+        count += spectral_icp.poses_differ(source, other, near)
+    return 2 * count > len(voters)
+
+
+def align_all(
+    bases: Mapping[str, Basis], reference: str, alignment: str = "search"
+) -> dict[str, Alignment]:
+    """Align all shapes to the reference, with votes of some of them."""
+    voters = voters_of(bases, reference, alignment)
+    return {
+        name: align_voted(name, basis, bases[reference], reference, alignment, voters)
+        for name, basis in bases.items()
+    }
+
+
+def voters_of(bases: Mapping[str, Basis], reference: str, alignment: str = "search") -> Voters:
+    """Return at most ``N_VOTERS`` + 1 of the shapes with their poses; none for "icp", "given"."""
+    if alignment != "search":
+        return {}
+    names = itertools.islice((name for name in bases if name != reference), N_VOTERS + 1)
+    target = bases[reference]
+    return {name: (bases[name], transform_onto(bases[name], target)) for name in names}
+
+
+def align_voted(
+    name: str, basis: Basis, target: Basis, reference: str, alignment: str, voters: Voters
+) -> Alignment:
+    """Align a shape of a network with the votes of other shapes."""
+    others = dict(itertools.islice(_without(voters, name), N_VOTERS))
+    if name != reference:
+        return align_onto(basis, target, alignment, others)
+    return ambiguity_of_reference(basis, others) if others else Alignment(*IDENTITY)
+
+
+def _without(voters: Voters, name: str) -> Iterable[tuple[str, tuple[Basis, RigidTransform]]]:
+    return ((other, voter) for other, voter in voters.items() if other != name)
