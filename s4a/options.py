@@ -299,7 +299,8 @@ class Options:
     landmarks: Path | str | None = reading(None,
         "folder of landmark files, named as the shapes, that guide alignment and elastic "
         "registration",
-        more="The formats are 3D Slicer (.mrk.json), CSV and MeshLab (.pp).  Shapes without a file "
+        more="The formats are those of :func:`s4a.input.annotations.read_landmarks`.  Shapes "
+        "without a file "
         "have no landmarks.  Landmarks of two shapes are paired by name.  "
         ":func:`s4a.with_landmarks` adds landmarks to a mesh in memory")
     features: str | list[str] | None = reading(None,

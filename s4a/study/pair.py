@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from s4a.input.collection import Mesh, as_mesh
+from s4a.input.collection import Mesh, as_meshes
 from s4a.method import fmap
 from s4a.method.alignment import align_onto, alignment_residual, less_confident
 from s4a.method.initial_map import initial_map
@@ -116,9 +116,9 @@ def match_pair(
     """
     settings = given_options({"preset": preset, **options}, pair=True)
     settings = settings.changed({"keep_iterations": keep_iterations})
-    meshes = as_mesh(source, "source"), as_mesh(target, "target")
+    meshes = as_meshes({"source": source, "target": target}, settings)
     with threadpool_limits(1):  # matrices are small: more BLAS threads take longer
-        M, N = (shape_of(mesh, settings) for mesh in meshes)
+        M, N = (shape_of(mesh, settings) for mesh in meshes.values())
         registration, maps = match_shapes(M, N, settings)
     least = min(M.low.k, N.low.k)
     if least < settings.k:
