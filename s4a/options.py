@@ -404,8 +404,8 @@ class Options:
         ":func:`s4a.method.median.distance_to_identity` has the formulas")
     keep_iterations: bool = network(False,
         "store the maps, latent bases and matches of every iteration of Consistent ZoomOut",
-        pair=True, more="They are the nodes of ``/iterations``.  The descriptors of initial maps "
-        "are in ``/network``.  :func:`s4a.match_pair` returns the iterations of ZoomOut")
+        more="They are the nodes of ``/iterations``.  The descriptors of initial maps are in "
+        "``/network``.  :func:`s4a.match_pair` has the same option for the iterations of ZoomOut")
     template: str | None = registration(None,
         "name of the shape to register to; by default the median shape")
     dense_match: str = registration("latent",

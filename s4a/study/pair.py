@@ -21,7 +21,12 @@ log = logging.getLogger(__name__)
 
 
 def match_pair(
-    source: Mesh, target: Mesh, *, preset: str | None = None, **options: Any
+    source: Mesh,
+    target: Mesh,
+    *,
+    preset: str | None = None,
+    keep_iterations: bool = False,
+    **options: Any,
 ) -> xr.Dataset:
     """Match two shapes at full resolution (4.1).
 
@@ -36,11 +41,13 @@ def match_pair(
     preset : {None, "paper", "fast"}
         ``"paper"`` uses the method of 4.1 without additions; ``"fast"`` sets n_coarse=3000.  None
         uses the defaults of S4A.
+    keep_iterations : bool
+        Whether to return map and match of every iteration of ZoomOut, and the descriptors of the
+        initial map.
     **options
         ``n_coarse, k_init, k, step, init, initial_refinement, full_resolution_iterations, refine,
-        articulated, refined_eigenfunctions, alignment, area_weighted, n_projected, method,
-        keep_iterations, seed`` or ``rng``.  :class:`s4a.Options` describes them and has their
-        defaults.
+        articulated, refined_eigenfunctions, alignment, sampling, area_weighted, n_projected,
+        method, seed`` or ``rng``.  :class:`s4a.Options` describes them and has their defaults.
 
     Returns
     -------
@@ -108,6 +115,7 @@ def match_pair(
     <TiledFigure ...>
     """
     settings = given_options({"preset": preset, **options}, pair=True)
+    settings = settings.changed({"keep_iterations": keep_iterations})
     meshes = as_meshes({"source": source, "target": target}, settings)
     with threadpool_limits(1):  # matrices are small: more BLAS threads take longer
         M, N = (shape_of(mesh, settings) for mesh in meshes.values())
