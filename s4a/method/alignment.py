@@ -59,8 +59,8 @@ class Alignment(NamedTuple):
         if len(self.fits) < 2:
             return ""
         best, second, *_ = self.fits
-        values = {"number": len(self.fits), "best": best, "second": second, "angle": self.angle}
-        return flag("pose", **values).words
+        number, angle = len(self.fits), self.angle
+        return flag("pose", number=number, best=best, second=second, angle=angle).words
 
 
 def less_confident(registration: xr.Dataset, n_poses: int) -> xr.Dataset:
