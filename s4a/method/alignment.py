@@ -122,9 +122,7 @@ def pair_transform(
 
 def alignment_residual(source: Basis, target: Basis, transform: RigidTransform) -> float:
     """Root mean square distance of nearest vertices, in both directions, after a transform."""
-    X, Y = (
-        basis.cloud._replace(normals=None, tree=cKDTree(basis.X)) for basis in (source, target)
-    )
+    X, Y = (basis.cloud._replace(normals=None, tree=cKDTree(basis.X)) for basis in (source, target))
     return residual_of(icp(X, Y, *transform, iterations=1))
 
 
