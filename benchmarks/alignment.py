@@ -12,6 +12,8 @@ that are rotated at random: share of equal matches, and differences of the varia
 ``alignment.py femurs``: 16 femurs that are not aligned: rotations, and landmark errors after
 ``s4a.analyse`` and after rigid ICP.
 
+``alignment.py tori``: errors of four tori with ground truth.
+
 ``alignment.py modes``: simulated modes that are found with the preset of the paper, by alignment.
 
 The real collections are in the shared data beside the checkout.
@@ -108,19 +110,58 @@ def bumpy(seed, bump, axes):
 
 
 def torus(seed, n=(90, 40)):
-    """Return a torus with own radii along the angle u, all in one pose."""
-    u, v = np.meshgrid(*(np.arange(k) * 2 * np.pi / k for k in n), indexing="ij")
-    a, b, c = np.random.default_rng(seed).normal(0, 0.12, 3)
+    """Return a torus with own radii along the angle u and own vertices, all in one pose."""
+    i, j = np.indices(n)
+    corner = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)]
+    vertex = [((a % n[0]) * n[1] + b % n[1]).ravel() for a, b in corner]
+    parts = ((0, 1, 2), (0, 2, 3))
+    T = np.concatenate([np.stack([vertex[k] for k in part], axis=1) for part in parts])
+    return torus_position(seed, *torus_angles(seed, n)), T
+
+
+def torus_angles(seed, n=(90, 40)):
+    """Angles u and v of the vertices of a torus ``(2, n)``."""
+    start, _ = torus_numbers(seed)
+    u, v = ((np.arange(k) + o) * 2 * np.pi / k for k, o in zip(n, start, strict=True))
+    return np.array(np.meshgrid(u, v, indexing="ij")).reshape(2, -1)
+
+
+def torus_numbers(seed):
+    """Random numbers of a torus: offsets of its vertices, and the three of its radii."""
+    rng = np.random.default_rng(seed)
+    _, *start = rng.uniform(size=3)
+    return start, rng.normal(0, 0.12, 3)
+
+
+def torus_position(seed, u, v):
+    """Positions ``(n, 3)`` of angles on a torus."""
+    _, (a, b, c) = torus_numbers(seed)
     r = 0.35 * (1 + 0.35 * np.cos(u) + a * np.cos(2 * u) + b * np.sin(u))
     R = 1 + 0.25 * np.cos(u + 0.3) + c * np.sin(2 * u) + r * np.cos(v)
-    X = np.stack([R * np.cos(u), 1.2 * R * np.sin(u), r * np.sin(v) + 0.15 * np.sin(u)], axis=-1)
-    i, j = (index.ravel() for index in np.indices(n))
-    vertex = lambda i, j: (i % n[0]) * n[1] + j % n[1]  # noqa: E731
-    corner = [vertex(i, j), vertex(i + 1, j), vertex(i + 1, j + 1), vertex(i, j + 1)]
-    T = np.concatenate(
-        [np.stack([corner[k] for k in part], axis=1) for part in ((0, 1, 2), (0, 2, 3))]
-    )
-    return X.reshape(-1, 3), T
+    x, y, z = R * np.cos(u), 1.2 * R * np.sin(u), r * np.sin(v) + 0.15 * np.sin(u)
+    return np.stack([x, y, z], axis=-1)
+
+
+def tori():
+    """Print mean errors of four tori in % of sqrt(area), and their status, by alignment."""
+    title("alignment", "template", "shape", "error", "status", "confidence")
+    meshes = collection("tori", 4)
+    for alignment in ("given", "search"):
+        study = s4a.analyse(meshes, n_coarse=1000, k=40, alignment=alignment, intersections=False)
+        registration, report = study["registration"], study["report"]
+        template = registration.attrs["template"]
+        kept = study["original"][template]["file_vertex"].values
+        angles = torus_angles(int(template[-1]))[:, kept]
+        size = np.sqrt(registration["vertex_area"].values.sum())
+        for name in meshes:
+            if name == template:
+                continue
+            one = registration.sel(shape=name)
+            X = study["original"][name]["position"].values[one["registered_match"].values]
+            true = torus_position(int(name[-1]), *angles)
+            error = 100 * np.linalg.norm(X - true, axis=1).mean() / size
+            status, confidence = report["status"].sel(shape=name).item(), one["confidence"].values
+            say(alignment, template, name, f"{error:.1f}", status, f"{confidence.mean():.2f}")
 
 
 def low_of(mesh, n_coarse=500):
@@ -227,11 +268,12 @@ def rotations(names):
         say(name, len(meshes), f"{100 * equal:.2f} %", f"{most:.0e}")
 
 
-def femurs(n_coarse=2000):
+def femurs(n_coarse=1000):
     """Print rotations and landmark errors of femurs after registration, and after rigid ICP."""
     meshes = collection("femurs_sicas")
     marks = {name: landmarks_of(DATA / "femurs_sicas" / f"{name}.json") for name in meshes}
-    study = s4a.analyse(meshes, n_coarse=n_coarse, intersections=False)
+    options = {"n_coarse": n_coarse, "k": 60, "intersections": False}
+    study = s4a.analyse(meshes, **options)
     registration, report = study["registration"], study["report"]
     template = registration.attrs["template"]
     X = registration["position"].values
@@ -278,7 +320,7 @@ def modes():
 if __name__ == "__main__":
     logging.disable(logging.WARNING)
     what, *names = sys.argv[1:] or [""]
-    actions = {"accuracy": accuracy, "femurs": femurs, "modes": modes}
+    actions = {"accuracy": accuracy, "femurs": femurs, "modes": modes, "tori": tori}
     lists = {"ambiguous": ambiguous, "rotations": rotations}
     if what in lists:
         lists[what](names)

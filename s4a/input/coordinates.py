@@ -244,13 +244,19 @@ def with_system(mesh: xr.Dataset, coordinate_system: str | None, unit: str | Non
     return mesh.assign_attrs(CoordinateSystem.of(mesh.attrs).filled(given).attrs)
 
 
+def says_nothing(mesh: xr.Dataset) -> bool:
+    """Return whether a mesh is given in memory without axes and unit; it is never converted."""
+    system = CoordinateSystem.of(mesh.attrs)
+    return not (system.axes or system.unit or mesh.attrs.get("path"))
+
+
 def in_axes(mesh: xr.Dataset, target: CoordinateSystem, what: str = "a mesh") -> xr.Dataset:
     """Convert axes and unit of a mesh; the attribute ``reason`` records it.
 
     Raises ValueError if axes or unit of the mesh, or of the target, are unknown.
     """
     system = CoordinateSystem.of(mesh.attrs)
-    if (system.axes, system.unit) == (target.axes, target.unit):
+    if (system.axes, system.unit) == (target.axes, target.unit) or says_nothing(mesh):
         return mesh
     common({what: system, "the others": target})
     new = replace(system, axes=target.axes, unit=target.unit)
@@ -267,7 +273,8 @@ def in_axes(mesh: xr.Dataset, target: CoordinateSystem, what: str = "a mesh") ->
 
 def in_one_system(meshes: Mapping[str, xr.Dataset]) -> dict[str, xr.Dataset]:
     """Return meshes in one system of axes and one unit, see :func:`common`."""
-    target = common({name: CoordinateSystem.of(mesh.attrs) for name, mesh in meshes.items()})
+    said = {name: mesh for name, mesh in meshes.items() if not says_nothing(mesh)}
+    target = common({name: CoordinateSystem.of(mesh.attrs) for name, mesh in said.items()})
     return {name: in_axes(mesh, target, name) for name, mesh in meshes.items()}
 
 

@@ -32,9 +32,9 @@ from s4a.method.shape import Basis, corresponding_landmarks
 from s4a.options import check
 
 N_VOTERS = 6
-# of sqrt(area): poses fit alike if the root of the difference of their mean squared residuals is
-# below it; the shapes of a collection differ from each other by about 0.04.  With fewer vertices
-# than ENOUGH their spacing hides part of the difference
+# of sqrt(area): poses fit alike if the root of the difference of their squared residuals is below
+# it to a quarter of the voters; shapes of a collection differ from each other by about 0.04.  With
+# fewer vertices than ENOUGH their spacing hides part of the difference
 ALIKE, ENOUGH = 0.023, 500
 _COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
 IDENTITY = np.eye(3), np.zeros(3)
@@ -59,8 +59,8 @@ class Alignment(NamedTuple):
         if len(self.fits) < 2:
             return ""
         best, second, *_ = self.fits
-        values = {"number": len(self.fits), "best": best, "second": second, "angle": self.angle}
-        return flag("pose", **values).words
+        number, angle = len(self.fits), self.angle
+        return flag("pose", number=number, best=best, second=second, angle=angle).words
 
 
 def less_confident(registration: xr.Dataset, n_poses: int) -> xr.Dataset:
@@ -165,19 +165,21 @@ def _after(first: RigidTransform, second: RigidTransform) -> RigidTransform:
 
 def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Alignment:
     """Choose the pose with the least mean squared residual to the voters."""
-    squared = np.zeros(len(found))
+    rows = []
     for other, onto in voters.values():
         starts = [relative_transform(pose, onto) for pose in found]
         ends = icp_each(source.cloud, other.cloud, starts, tolerance=5 * ROUGH)
-        squared += np.array([residual for *_, residual in ends]) ** 2 / len(voters)
-    order = np.argsort(squared, kind="stable")
+        rows.append([residual**2 for *_, residual in ends])
+    squared = np.array(rows)  # (voters, poses)
+    order = np.argsort(squared.mean(0), kind="stable")
+    squared, (R, t) = squared[:, order], found[order[0]]
     limit = ALIKE**2 * min(1.0, len(source.X) / ENOUGH)
-    best, alike = order[0], squared[order] - squared.min() < limit
-    R, t = found[best]
-    fits = tuple(np.sqrt(squared[order[alike]]).tolist())
+    alike = np.quantile(squared - squared[:, :1], 0.25, axis=0) < limit
+    fits = tuple(np.sqrt(squared.mean(0)[alike]).tolist())
     if len(fits) < 2 or _differs(source, voters, (R, t)):
         return Alignment(R, t, fits[:1])
-    cosine = (np.trace(R.T @ found[order[1]][0]) - 1) / 2
+    second = found[order[np.flatnonzero(alike)[1]]][0]
+    cosine = (np.trace(R.T @ second) - 1) / 2
     return Alignment(R, t, fits, float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))))
 
 

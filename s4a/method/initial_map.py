@@ -293,7 +293,13 @@ def _have_signatures(source, target, k):
 
 
 def initial_map(
-    source: Basis, target: Basis, transform: RigidTransform, *, search: bool = False, **options: Any
+    source: Basis,
+    target: Basis,
+    transform: RigidTransform,
+    *,
+    search: bool = False,
+    alignment: str = "search",
+    **options: Any,
 ) -> _InitialMap:
     """Compute an initial map: :func:`map_after_alignment`, or the best of several if poses differ.
 
@@ -305,10 +311,14 @@ def initial_map(
     search : bool
         See :func:`best_initial_map`; for single pairs, as Consistent ZoomOut corrects the maps of a
         network.
+    alignment : {"search", "icp", "given"}
+        Only the map after alignment is used if the pose is given, as others can be of other poses.
     **options
         Options of :func:`map_after_alignment`; `n_samples` is ignored if poses differ.
     """
     initial = map_after_alignment(source, target, transform, **options)
+    if alignment == "given":
+        return initial
     differ = initial.name == "dense" and spectral_icp.poses_differ(source, target, initial.near)
     if not (differ and _have_signatures(source, target, len(initial.C))):
         return initial

@@ -657,7 +657,8 @@ def out_of_sample_basis(
     for other, transform in zip(others, transforms, strict=True):
         R, t = pair_transform(new, other, transform, alignment)
         back = R.T, -R.T @ t
-        maps.append(initial_map(other, new, back, k_init=k_init, n_samples=n_samples, **options).C)
+        settings = {"k_init": k_init, "n_samples": n_samples, "alignment": alignment, **options}
+        maps.append(initial_map(other, new, back, **settings).C)
     return _zoomout_of_new(new, others, Y, maps, step=step, n_samples=n_samples)
 
 

@@ -165,7 +165,7 @@ def map_pairs(
         M, N = bases[a], bases[b]
         R, t = pair_transform(M, N, relative_transform(transforms[a], transforms[b]), alignment)
         R_back, t_back = R.T, -R.T @ t
-        forth = initial_map(M, N, (R, t), **options)
+        forth = initial_map(M, N, (R, t), alignment=alignment, **options)
         back = map_after_alignment(N, M, (R_back, t_back), **options)
         if forth.name != init:  # large pose difference: both directions must match the same limbs
             back = back._replace(C=fmap.refine_once(N, M, forth.C.T), fitted=forth.C.T)

@@ -161,6 +161,7 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
         init=options.init,
         initial_refinement=initial_refinement,
         search=True,
+        alignment=options.alignment,
     )
     kept: list[tuple[np.ndarray, np.ndarray]] = []
     keep = (lambda *pair: kept.append(pair)) if options.keep_iterations else None

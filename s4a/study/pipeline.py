@@ -513,7 +513,11 @@ def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Optio
                 register_shape,
                 (run.folder, n, template, options),
                 (template_key, key, *of_latent.values()),
-                (f"registration={template_key}", *names_and_keys("latent", of_latent)),
+                (
+                    f"registration={template_key}",
+                    *names_and_keys("coarse", {n: key}),
+                    *names_and_keys("latent", of_latent),
+                ),
             )
         )
     registered = run.do("registration", todo)

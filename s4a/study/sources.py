@@ -9,7 +9,7 @@ import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
 from s4a.input.annotations import feature_files
-from s4a.input.coordinates import CoordinateSystem, common
+from s4a.input.coordinates import CoordinateSystem, common, says_nothing
 from s4a.input.files import check_names, files_named, find_meshes, systems_of
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import read_bytes, shown
@@ -109,7 +109,8 @@ def common_system(sources: Sources, options: Options) -> tuple[dict[str, str], l
     Raises ValueError if some systems are known and others are not.
     """
     given = CoordinateSystem.of(vars(options))
-    systems = systems_of({name: mesh for name, (mesh, _) in sources.items()}, given)
+    said = {n: m for n, (m, _) in sources.items() if isinstance(m, str) or not says_nothing(m)}
+    systems = systems_of(said, given)
     target = common(systems)
     others = [
         f"{n} ({s})" for n, s in systems.items() if (s.axes, s.unit) != (target.axes, target.unit)

@@ -171,15 +171,16 @@ def test_a_mesh_is_converted_with_its_landmarks_and_faces_outward():
     assert in_file(found, X, back=True) == pytest.approx(X * [-1000, 1000, 1000])
 
 
-def test_a_collection_is_converted_or_told_what_is_missing():
+def test_a_collection_is_converted_or_told_what_is_missing(tmp_path):
     meshes = {f"s{i}": as_dataset(X * [-1, -1, 1] if i == 2 else X, T) for i in range(3)}
     for name, text in {"s0": "RAS", "s1": "RAS", "s2": "LPS"}.items():
         meshes[name].attrs |= system(text).attrs
     tree = read_shapes(meshes, compare=False)
     assert tree["original/s2/position"].values == pytest.approx(X)
     assert tree["report/coordinate_system"].values.tolist() == ["RAS, mm", "RAS, mm", "LPS, mm"]
+    write_mesh(tmp_path / "s2.ply", X, T)
     with pytest.raises(ValueError, match=r"found RAS, mm: s0, s1; unknown: s2: coordinate_system="):
-        s4a.analyse(meshes | {"s2": as_dataset(X, T)})
+        s4a.analyse(meshes | {"s2": tmp_path / "s2.ply"})
     with pytest.raises(ValueError, match="unit must be one of um, mm, cm, m, in; found 'inch'"):
         s4a.analyse(meshes, unit="inch")
 
