@@ -24,9 +24,6 @@ from unittest import mock
 
 import differences
 import numpy as np
-from scipy.optimize import linprog
-from scipy.sparse import csr_matrix, diags
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
 import s4a
@@ -34,7 +31,6 @@ from s4a import synthetic
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
-from s4a.method.initial_map import landmarks_after_alignment
 from s4a.method.remesh import silence
 from s4a.options import DECLARED, PRESETS
 from s4a.schema import dataset
@@ -48,68 +44,14 @@ CARRIED = 300  # vertices of the template that are transferred as landmarks
 # ------------------------------------------------------------------------------ what the paper had
 
 
-def geodesic_farthest(X, T, G, boundary, avoid, k, seed=0):
-    """ReMatching's samples: farthest points along the edges, one at a time."""
-    start = np.flatnonzero(~avoid)[0]
-    distance = dijkstra(G, indices=start)
-    samples = [int(np.argmax(np.where(np.isfinite(distance), distance, -1)))]
-    distance = dijkstra(G, indices=samples[0])
-    while len(samples) < k:
-        new = int(np.argmax(np.where(np.isfinite(distance) & ~avoid, distance, -1)))
-        samples.append(new)
-        near = dijkstra(G, indices=new, limit=distance[new])
-        distance = np.minimum(distance, near)
-    return np.sort(samples)
-
-
 def closest_in_space(X, cell, Y, C):
     """ReMatching's U: the closest point in space of the whole coarse mesh."""
     return closest_point(X, Y, C)
 
 
-def program_errors(C, cycles, k=None, *, n_jobs=1):
-    """Errors of maps by the linear program of Huang et al. (2020), as in pyFM.
-
-    The least of weighted sums such that those of the three maps of a cycle are what it lacks.
-    """
-    ij, jk, ki = cycles.T
-    lack = np.linalg.norm(C[ki] @ C[jk] @ C[ij] - np.eye(C.shape[1]), axis=(1, 2))
-    rows = np.repeat(np.arange(len(cycles)), 3)
-    A = csr_matrix((np.ones(3 * len(cycles)), (rows, cycles.ravel())), (len(cycles), len(C)))
-    found = linprog(1 / (A.T @ lack), A_ub=-A, b_ub=-lack, bounds=(0, None), method="highs-ds")
-    return found.x
-
-
-def pyfm_fit(source, target, transform, *, k_init=20, init="landmarks", near=None):
-    """PyFM's initial map: wave kernels of the shapes and around the landmarks, its own weights."""
-    from pyFM.functional import FunctionalMapping
-    from pyFM.mesh import TriMesh
-
-    landmarks = landmarks_after_alignment(source.X, target.X, transform)
-    meshes = []
-    for basis in (source, target):
-        mesh = TriMesh(basis.X, basis.T)
-        mesh.eigenvalues, mesh.eigenvectors, mesh.A = basis.eigenvalue, basis.Phi, diags(basis.area)
-        meshes.append(mesh)
-    model = FunctionalMapping(*meshes)
-    marks = np.stack(landmarks, axis=1)
-    k = min(source.k, target.k)  # with more, pyFM computes functions of its own
-    model.preprocess(
-        n_descr=100, landmarks=marks, subsample_step=5, k_process=k, k_descr=k, verbose=False
-    )
-    model.fit(K=(k_init, k_init), w_descr=1, w_lap=1e-2, w_dcomm=1e-1, verbose=False)
-    return model.FM_12, landmarks
-
-
 # what is put in the place of ours, where there is no switch
 INSTEAD = {
     "U by closest points in space": {"s4a.method.remesh.closest_point_in_star": closest_in_space},
-    "samples and U of ReMatching": {
-        "s4a.method.remesh.closest_point_in_star": closest_in_space,
-        "s4a.method.remesh.sample_surface": geodesic_farthest,
-    },
-    "initial maps of pyFM": {"s4a.method.initial_map.fit_after_alignment": pyfm_fit},
-    "weights of the linear program": {"s4a.method.latent.cycle_errors": program_errors},
 }
 PAPER = PRESETS["paper"]
 DEFAULTS = PRESETS[None]
@@ -127,16 +69,19 @@ ON_THE_PAPER = {
     "area_weighted": {"area_weighted": True},
     "n_projected": {"n_projected": N_PROJECTED},
 }
-READINGS = {
-    "dense_match": "fmap",
-    "method": "scalable",
-    "initial_refinement": "never",
-    "weights": "equal",
-    "n_latent": 90,
-    "step": 10,
-    "isometric": True,
-    "alignment": "given",
-}
+READINGS = [
+    ("dense_match", "fmap"),
+    ("method", "scalable"),
+    ("sampling", "geodesic"),
+    ("initial_refinement", "never"),
+    ("init", "wave_kernels"),
+    ("isometric", True),
+    ("weights", "equal"),
+    ("weights", "linear_program"),
+    ("n_latent", 90),
+    ("step", 10),
+    ("alignment", "given"),
+]
 NORMS = ("h2", "h1", "frobenius", "h2_image", "h2_both")
 OF_A_PAIR = ("refine", "init", "initial_refinement", "full_resolution_iterations", "bidirectional")
 
@@ -148,7 +93,7 @@ def study_rows():
     rows |= {f"default without {name}": {name: PAPER[name]} for name in ("init", "articulated")}
     rows["default, spectral_icp"] = {"refine": "spectral_icp"}
     rows["default, refined_eigenfunctions"] = {"refined_eigenfunctions": True}
-    rows |= {f"paper, {name}={value}": PAPER | {name: value} for name, value in READINGS.items()}
+    rows |= {f"paper, {name}={value}": PAPER | {name: value} for name, value in READINGS}
     rows |= {f"paper, {name}": PAPER for name in INSTEAD}
     rows |= {f"paper, norm={name}": PAPER | {"norm": name, "template": None} for name in NORMS}
     return rows

@@ -1,6 +1,6 @@
 """Check of the columns of a table: findings in simulated columns, clean and with one wrong value.
 
-``python benchmarks/columns.py`` prints the table of docs/reliability, in two minutes.
+``python benchmarks/columns.py`` prints the table of docs/plausibility.md, in a minute.
 """
 
 import logging
@@ -11,7 +11,7 @@ import numpy as np
 from s4a.input.columns import check_column
 
 SIZES = (5, 10, 20, 50)
-TIMES = 400
+TIMES = 200
 # clean columns of n numbers
 CLEAN = {
     "ages of adults": lambda rng, n: rng.integers(18, 90, n),

@@ -170,7 +170,7 @@ def check(name: str, value: Any) -> Any:
     >>> from s4a.options import check
     >>> check("init", "landmark")
     Traceback (most recent call last):
-    ValueError: init must be one of 'dense', 'landmarks'; found 'landmark'
+    ValueError: init must be one of 'dense', 'landmarks', 'wave_kernels'; found 'landmark'
     """
     from s4a.schema import check_choice, check_count, check_switch, check_text
 
@@ -299,7 +299,8 @@ class Options:
     landmarks: Path | str | None = reading(None,
         "folder of landmark files, named as the shapes, that guide alignment and elastic "
         "registration",
-        more="The formats are 3D Slicer (.mrk.json), CSV and MeshLab (.pp).  Shapes without a file "
+        more="The formats are those of :func:`s4a.input.annotations.read_landmarks`.  Shapes "
+        "without a file "
         "have no landmarks.  Landmarks of two shapes are paired by name.  "
         ":func:`s4a.with_landmarks` adds landmarks to a mesh in memory")
     features: str | list[str] | None = reading(None,
@@ -321,6 +322,12 @@ class Options:
         more="The meshes have between 95 and 110 % of this number, usually 95 %: 5,700 of 6,000, "
         "since the rest is for repairs of the topology.  With SCALABLE it is the number "
         "of samples")
+    sampling: str = network("normals",
+        "samples of the low-resolution meshes: farthest points in position and normal (normals), "
+        "or, as in ReMatching, along the surface, with U from closest points in space (geodesic)",
+        choices=("normals", "geodesic"), section="4.1, step 1", see="method/remesh",
+        of="low resolution", pair=True,
+        more="Geodesic samples ignore curvature, and U then crosses thin walls")
     wrap: bool = network(False, "wrap the shapes in a watertight surface before remeshing",
         of="low resolution")
     refined_eigenfunctions: bool = network(False,
@@ -347,8 +354,10 @@ class Options:
         "of the files.  A shape that fits others alike in two poses is flagged.  Landmarks replace "
         "the search and the pose from which plain ICP starts.  Use 'given' for aligned data")
     init: str = network("dense",
-        "initial maps from the nearest neighbours of all vertices, or from 10 landmarks",
-        choices=("dense", "landmarks"), paper="landmarks", section="4.1, steps 3 and 4",
+        "initial maps from nearest neighbours of all vertices (dense), from 10 landmarks, or as "
+        "in pyFM from wave kernels of the shapes and around these landmarks (wave_kernels)",
+        choices=("dense", "landmarks", "wave_kernels"), paper="landmarks",
+        section="4.1, steps 3 and 4",
         instead="initial map fitted to 10 landmarks", see="method/initial_map", of="initial maps",
         pair=True,
         more="Nearest neighbours are found after ICP.  If poses differ a lot, the best of several "
@@ -366,10 +375,11 @@ class Options:
     n_latent: int | None = network(None, "dimension of the latent space; by default k", least=2,
         section="eq. 3")
     weights: str = network("cycles",
-        "weights of the maps: from their cycle errors (cycles), or all 1 (equal)",
-        choices=("cycles", "equal"), section="eq. 3", see="method/network")
+        "weights of the maps: from their mean cycle errors (cycles), as in pyFM from errors by a "
+        "linear program (linear_program), or all 1 (equal)",
+        choices=("cycles", "linear_program", "equal"), section="eq. 3", see="method/network")
     isometric: bool = network(False,
-        "before each iteration of Consistent ZoomOut, replace the two maps of a pair by the more "
+        "before each latent basis of Consistent ZoomOut, replace both maps of a pair by the more "
         "orthogonal one and its transpose, as pyFM does", section="4.2", see="method/latent",
         more="The maps then preserve area, so the energies of eq. 5 are smaller.  In pyFM this is "
         "``isometric`` of ``FMN.zoomout_refine``, which is True by default")
@@ -394,8 +404,8 @@ class Options:
         ":func:`s4a.method.median.distance_to_identity` has the formulas")
     keep_iterations: bool = network(False,
         "store the maps, latent bases and matches of every iteration of Consistent ZoomOut",
-        pair=True, more="They are the nodes of ``/iterations``.  The descriptors of initial maps "
-        "are in ``/network``.  :func:`s4a.match_pair` returns the iterations of ZoomOut")
+        more="They are the nodes of ``/iterations``.  The descriptors of initial maps are in "
+        "``/network``.  :func:`s4a.match_pair` has the same option for the iterations of ZoomOut")
     template: str | None = registration(None,
         "name of the shape to register to; by default the median shape")
     dense_match: str = registration("latent",
@@ -491,6 +501,8 @@ class Options:
                 f"method='scalable' has no coarse mesh, and {without[0]}=True "
                 f"{WITHOUT_MESH[without[0]]}"
             )
+        elif self.method == "scalable" and self.sampling != "normals":
+            why = f"method='scalable' has samples of its own, and sampling={self.sampling!r} others"
         elif self.include_flagged and self.quality_control == "stop":
             why = (
                 "include_flagged=True includes flagged shapes and quality_control='stop' ends the "

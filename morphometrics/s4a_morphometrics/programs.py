@@ -20,7 +20,7 @@ from s4a.analysis.volumes import write_label_volumes
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.input.annotations import write_landmarks
-from s4a.input.coordinates import CoordinateSystem, moved
+from s4a.input.coordinates import CoordinateSystem, moved, turned
 from s4a.input.files import write_mesh
 from s4a.input.formats import vtp_bytes
 from s4a.input.landmarks import locate
@@ -153,7 +153,7 @@ def write_slicer(
         registered = registration.sel(shape=shape)
         M, system = map_to_scan(study, shape, given, "mm")
         points = moved(image_in_shape(X, registered), M)
-        triangles = T[:, ::-1] if np.linalg.det(M) < 0 else T
+        triangles = turned(T, M)
         unknown += [] if system.axes else [shape]
         paths.append(folder / f"{shape}.vtk")
         confidence = registered["confidence"].values

@@ -142,8 +142,7 @@ def analyse_structures(
         (folder / FOLDER).mkdir(parents=True, exist_ok=True)
         notes: dict[str, Any] = {"structures": list(parts), "remarks": remarks}
         notes |= {"mirrored": mirrored, "chirality": chirality}
-        (folder / f"{NOTES}.tmp").write_text(json.dumps(notes))
-        (folder / f"{NOTES}.tmp").replace(folder / NOTES)
+        write_notes(folder, notes)
         studies = {}
         for name, part in parts.items():
             log.info("structure %s", name)
@@ -157,7 +156,34 @@ def analyse_structures(
                 )
             except ValueError as error:
                 raise ValueError(f"structure {name}: {error}") from error
+        write_notes(folder, notes | {"keys": keys_of(studies)})
     return tree_of(studies, notes)
+
+
+def write_notes(folder: Path, notes: Mapping[str, Any]) -> None:
+    """Write the notes of a multi-structure study to its folder."""
+    (folder / f"{NOTES}.tmp").write_text(json.dumps(notes))
+    (folder / f"{NOTES}.tmp").replace(folder / NOTES)
+
+
+def keys_of(studies: Mapping[str, xr.DataTree]) -> dict[str, str]:
+    """Return the keys of the latent bases of finished studies, by structure."""
+    return {
+        name: study["latent"].attrs.get("task_key", "")
+        for name, study in studies.items()
+        if "latent" in study.children
+    }
+
+
+def check_not_exchanged(studies: Mapping[str, xr.DataTree], keys: Mapping[str, str]) -> None:
+    """Raise ValueError if the folder of a structure holds the study of another one."""
+    for name, key in keys_of(studies).items():
+        held = [other for other, known in keys.items() if known == key]
+        if held and name not in held:
+            raise ValueError(
+                f"the folder {FOLDER}/{name} holds {held[0]}, is named {name}: folders were "
+                "exchanged or renamed; give them back their names"
+            )
 
 
 @contextmanager
@@ -513,6 +539,7 @@ def open_structures(folder: Path | str) -> xr.DataTree:
                     "replace it by the folder itself"
                 )
         studies[name] = s4a.open_study(folder / FOLDER / name)
+    check_not_exchanged(studies, notes.get("keys", {}))
     return tree_of(studies, notes)
 
 

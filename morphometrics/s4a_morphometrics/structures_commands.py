@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from s4a.cli.commands import SYSTEM, new_folder, on_cluster, within, write
+from s4a.cli.commands import SYSTEM, exit_code, new_folder, on_cluster, within, write
 from s4a.cli.flags import Command, add_options, whole
 from s4a.options import DECLARED
 
@@ -28,7 +28,9 @@ def run(args: Namespace) -> int:
         write(f"structure {name}, study in {args.out}/structures/{name}")
         write(run_summary(part))
     write(f"\ns4a structures {args.out} compares them")
-    return 1 if any(part["report"].attrs["unforeseen"] for part in parts.values()) else 0
+    reports = [part["report"] for part in parts.values()]
+    unforeseen = any(report.attrs["unforeseen"] for report in reports)
+    return exit_code([report["status"] for report in reports], args.fail_on, int(unforeseen))
 
 
 def insert(args: Namespace) -> int:
@@ -49,7 +51,8 @@ def insert(args: Namespace) -> int:
         write_registered(part, out / "structures" / name)
         write(f"structures/{name}\n{inserted_table(part)}")
     write(f"\nwritten: {path}, registered meshes and scores in {out}")
-    return 1 if (inserted["report"]["structure_status"] == "excluded").any() else 0
+    status = inserted["report"]["structure_status"]
+    return exit_code([status], args.fail_on, int((status == "excluded").any()))
 
 
 def compare(args: Namespace) -> int:
@@ -103,6 +106,11 @@ def named_label(text: str) -> tuple[str, str]:
     return name, label
 
 
+def _fail_on(add: Callable[..., Any]) -> None:
+    text = "end with exit code 3 if shapes are excluded, or if shapes are flagged or excluded"
+    add("--fail-on", choices=("none", "excluded", "flagged"), default="none", help=text)
+
+
 def _run(add: Callable[..., Any]) -> None:
     add("paths", nargs="+", metavar="PATH", help="folders, globs or mesh files, or label volumes")
     text = "folder of the study; an unfinished one is resumed"
@@ -111,6 +119,7 @@ def _run(add: Callable[..., Any]) -> None:
     add("--cluster", metavar="ADDRESS", help=text)
     text = "label volumes with several structures each: left=17 right=53"
     add("--structures", nargs="+", type=named_label, metavar="NAME=LABEL", help=text)
+    _fail_on(add)
     add_options(add, OPTIONS)
 
 
@@ -123,6 +132,7 @@ def _insert(add: Callable[..., Any]) -> None:
     text = "new subjects to mirror: names, with commas; COLUMN=VALUE of the table; or auto"
     add("--reflect", metavar="NAMES", help=text)
     add("--table", metavar="PATH", help=TABLE)
+    _fail_on(add)
     add_options(add, [*SYSTEM, "n_jobs"])
 
 

@@ -218,3 +218,14 @@ def test_the_command_writes_the_trajectory(study_folder, tmp_path, capsys):
         "growth.html",
         "growth.gif",
     }
+
+
+def test_times_and_subjects_are_checked(simulated, caplog):
+    names = simulated["subjects"]["person"].values
+    with pytest.raises(ValueError, match="time: -999 of shape_02 is a code of a missing value"):
+        growth(simulated, np.where(np.arange(24) == 2, -999, AGE), names, n_permutations=9)
+    person = [*names[:2], f"{names[2]}\u200b", *names[3:]]
+    with pytest.raises(ValueError, match=r"subject: 'p0' .* 'p0.u200b' \(shape_02\) look alike"):
+        growth(simulated, AGE, person, n_permutations=9)
+    growth(simulated, AGE, [*names[:2], "P0", *names[3:]], n_permutations=9)
+    assert "'p0' (shape_00) differ only in case" in caplog.text

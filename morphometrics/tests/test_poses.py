@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import s4a
 from s4a import statistics
 from s4a.geometry.mesh import vertex_areas
+from s4a.input.coordinates import CoordinateSystem, transform
 from s4a.input.subjects import subjects as table_of
 from s4a.schema import dataset, in_unit
 from s4a_morphometrics import of_structure, structures, structures_modes, structures_of_new, within
@@ -257,6 +258,37 @@ def test_structures_that_cannot_be_compared_are_refused():
         structures(tree_of(drawn(0, pose=1, n=3)))
     study["structures/right/registration"] = xr.DataTree(in_unit(right, "m", of="mm"))
     with pytest.raises(ValueError, match="structures need one unit; found left: mm, right: m"):
+        structures(study)
+
+
+def test_structures_in_different_coordinate_systems_are_compared_in_one():
+    Y = drawn(3, pose=1, shape=1)
+    whole = structures(tree_of(Y), **FEW)
+    study, mirror = tree_of(Y), np.diag([-1.0, 1, 1, 1])
+    offsets = np.random.default_rng(0).uniform(-30, 30, (N, 3)).round(3).tolist()
+    for k, name in enumerate(NAMES):
+        data = study[f"structures/{name}/registration"].to_dataset().copy(deep=True)
+        data["rotation"] = data["rotation"].copy(data=np.tile(np.eye(3), (N, 1, 1)))
+        for i, shape in enumerate(data["shape"].values.tolist()):
+            text = f"surface RAS, c_ras {' '.join(map(str, offsets[i]))}" if k else "RAS"
+            attrs = {"coordinate_system": "LPS" if i % 2 and not k else text}
+            attrs |= {"unit": "mm" if k else "cm", "reflected": int(i == 4)}
+            ras = CoordinateSystem("RAS", "scanner", "mm")
+            M = transform(ras, CoordinateSystem.of(attrs))  # and now of the mirrored file
+            M = mirror @ M @ mirror if i == 4 else M
+            s = np.cbrt(np.linalg.det(M[:3, :3]))
+            data["rotation"].values[i] = M[:3, :3].T / s
+            data["scale"].values[i] = 1 / s
+            data["translation"].values[i] = -np.linalg.solve(M[:3, :3], M[:3, 3])
+            path = f"structures/{name}/original/{shape}"
+            study[path] = xr.DataTree(xr.Dataset(attrs=attrs))
+        study[f"structures/{name}/registration"] = xr.DataTree(data)
+    found = structures(study, **FEW)
+    for key in ("level_share", "pose_size"):
+        factor = 10 if key == "pose_size" and found["position"].attrs["units"] == "cm" else 1
+        assert factor * found[key].values == pytest.approx(whole[key].values, rel=1e-6), key
+    study["structures/left/original/s03"].attrs["coordinate_system"] = "RAS, origin unknown"
+    with pytest.raises(ValueError, match=r"RAS, origin unknown, cm: s03 \(left\); surface RAS"):
         structures(study)
 
 

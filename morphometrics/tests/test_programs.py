@@ -427,7 +427,74 @@ def test_a_mesh_in_lps_and_one_that_was_mirrored_fill_the_same_voxels(scans, tmp
         assert np.array_equal(nibabel.load(found).dataobj, nibabel.load(known).dataobj)
 
 
+# surfaces of FreeSurfer, which lie c_ras beside the scan
+
+
+@pytest.fixture(scope="module")
+def surfaces(study):
+    """The study as if its files were in surface RAS, and c_ras."""
+    moved = study.copy(deep=True)
+    for node in moved["original"].children.values():
+        node.attrs["coordinate_system"] = "surface RAS, c_ras 12 -20 35"
+    return moved, np.array([12.0, -20, 35])
+
+
+def test_exported_points_of_freesurfer_lie_where_the_scan_has_them(surfaces, tmp_path):
+    study, offset = surfaces
+    data, place = study["registration"].to_dataset(), {}
+    for name in data["shape"].values.tolist():
+        place[name] = image_in_shape(data["position"].values, data.sel(shape=name)) + offset
+    write_for(study, tmp_path, "slicer", n_points=5)
+    s4a.write_registered(study, tmp_path, format="gifti", frame="shape")
+    for name, scan in place.items():
+        assert read_mesh(tmp_path / f"{name}.vtk")[0] == pytest.approx(scan)
+        points = read_landmarks(tmp_path / "points" / f"{name}.mrk.json")
+        vertex = points["landmark_name"].values.astype(int)
+        assert points["landmark_position"].values == pytest.approx(scan[vertex])
+        image = nibabel.load(tmp_path / f"{name}.gii")
+        assert image.agg_data("pointset") == pytest.approx(scan, abs=1e-4)
+    vtk = pytest.importorskip("vtk")
+    reader = vtk.vtkPolyDataReader()
+    reader.SetFileName(str(tmp_path / f"{name}.vtk"))
+    reader.Update()
+    assert np.array(reader.GetOutput().GetPoint(7)) == pytest.approx(scan[7])
+
+
+def test_labels_of_freesurfer_surfaces_are_written_where_the_scan_has_them(
+    surfaces, study, tmp_path
+):
+    moved, offset = surfaces
+    affine = np.diag([5.0, 5, 5, 1])
+    affine[:3, 3] = -100
+    label, found = np.ones(study["registration"].sizes["vertex"], int), []
+    for tree, shift in ((study, np.zeros(3)), (moved, offset)):
+        affine_of = affine.copy()
+        affine_of[:3, 3] += shift
+        grid = tmp_path / f"{shift[0]}.mgz"
+        nibabel.save(nibabel.MGHImage(np.zeros((40,) * 3, np.uint8), affine_of), grid)
+        (path, *_) = write_for(tree, tmp_path / str(shift[0]), "nifti", label=label, grid=grid)
+        found.append(np.asanyarray(nibabel.load(path).dataobj))
+    assert np.array_equal(*found)
+    assert found[0].any()
+
+
 # what is refused
+
+
+def test_shapes_that_do_not_say_their_coordinates_are_not_written_into_a_scan(study, tmp_path):
+    plain = study.copy(deep=True)
+    for node in plain["original"].children.values():
+        del node.attrs["coordinate_system"]
+    scan = nibabel.Nifti1Image(np.zeros((40,) * 3, np.uint8), np.diag([5.0, 5, 5, 1]))
+    nibabel.save(scan, tmp_path / "scan.nii")
+    label = np.ones(study["registration"].sizes["vertex"], int)
+    options = {"label": label, "grid": tmp_path / "scan.nii"}
+    with pytest.raises(
+        ValueError, match=r"unknown mm.* cannot be converted to RAS, mm: coordinate_"
+    ):
+        write_for(plain, tmp_path / "out", "nifti", **options)
+    assert not (tmp_path / "out").exists()
+    assert write_for(plain, tmp_path / "out", "nifti", coordinate_system="RAS", **options)
 
 
 @pytest.mark.parametrize(

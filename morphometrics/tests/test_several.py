@@ -1,5 +1,7 @@
 """Multi-structure studies: shapes by subject, mirrored subjects, new subjects."""
 
+import shutil
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -97,6 +99,15 @@ def study(store):
 @pytest.fixture(scope="module")
 def new():
     return subjects(8, 200, seed=1)["subject_1"]
+
+
+def test_folders_of_structures_that_were_exchanged_are_refused_by_name(store, tmp_path):
+    folder = shutil.copytree(store, tmp_path / "study") / "structures"
+    (folder / "left").rename(folder / "other")
+    (folder / "right").rename(folder / "left")
+    (folder / "other").rename(folder / "right")
+    with pytest.raises(ValueError, match="structures/left holds right, is named left"):
+        open_structures(tmp_path / "study")
 
 
 def test_each_structure_has_the_same_study_as_its_meshes_alone(store, study, files, six):

@@ -12,7 +12,7 @@ from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_rows
 from s4a.input.chirality import map_to_file
-from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved
+from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved, turned
 from s4a.input.files import write_mesh
 from s4a.study import store
 
@@ -121,9 +121,11 @@ def write_registered(
         if frame == "shape":
             M, system = map_to_scan(study, name)
             points = moved(image_in_shape(X, registered), M)
-            triangles = T[:, ::-1] if np.linalg.det(M) < 0 else T
+            triangles = turned(T, M)
         has_scalars = format != "obj" and "confidence" in registered
-        scalars = {"confidence": registered["confidence"].values} if has_scalars else {}
+        scalars: dict[str, Any] = {}
+        if has_scalars:
+            scalars["confidence"] = registered["confidence"].values
         paths.append(folder / f"{name}{suffix}")
         write_mesh(paths[-1], points, triangles, **system.attrs, **scalars)
     paths.append(folder / f"template{suffix}")

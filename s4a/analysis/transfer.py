@@ -31,7 +31,8 @@ from s4a.geometry.closest import (
     interpolation_matrix,
 )
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas, vertex_normals
-from s4a.input.collection import Mesh, as_mesh
+from s4a.input.collection import Mesh, as_meshes
+from s4a.input.coordinates import CoordinateSystem
 from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, as_landmarks, locate, trace_curves
 from s4a.method.register import identity, uncertainty
 from s4a.method.remesh import laplacian
@@ -319,8 +320,8 @@ def register_pairs(
             f"shapes other than the template {name!r} are needed; found "
             f"{', '.join(shapes) or 'none'}"
         )
-    meshes = {n: as_mesh(mesh, f"mesh {n}") for n, mesh in {name: template, **shapes}.items()}
     settings = given_options({"preset": preset, **options}, pair=True)
+    meshes = as_meshes({name: template, **shapes}, settings)
     parallel = workers(n_jobs)
     inside, *others = parallel(delayed(_shape_of)(mesh, settings) for mesh in meshes.values())
     pairs = parallel(delayed(_match_both)(shape, inside, settings) for shape in others)
@@ -724,7 +725,8 @@ def transfer_landmarks(
     named = marked[[name for name in NAMED if name in marked]]
     transferred = {}
     for name, target, routes in routes_to_targets:
-        transferred[name] = _transfer_landmarks(marked, target, routes).merge(named)
+        image = _transfer_landmarks(marked, target, routes).merge(named)
+        transferred[name] = image.assign_attrs(CoordinateSystem.of(target.attrs).attrs)
     return xr.DataTree.from_dict(transferred)
 
 

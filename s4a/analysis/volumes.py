@@ -14,7 +14,7 @@ from s4a.analysis.transfer import transfer_labels
 from s4a.geometry.compiled import igl
 from s4a.geometry.mesh import as_arrays
 from s4a.input.chirality import map_to_file
-from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved
+from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved, turned
 from s4a.input.labels import read_grid, voxels_marked
 
 VOLUMES = ("NIfTI", "MGH")
@@ -140,7 +140,7 @@ def _map_to(grid, attrs, given, name):
 def _volume(mesh, M, name, label, grid, source_label):
     """Labels at the voxels of a grid ``(x, y, z)``, and the affine map."""
     Y, S = as_arrays(mesh)
-    Y, S = moved(Y, M), S[:, ::-1] if np.linalg.det(M) < 0 else S
+    Y, S = moved(Y, M), turned(S, M)
     if source_label is not None:
         inside, affine = voxels_marked(grid, source_label)
         voxel = np.argwhere(inside)

@@ -59,10 +59,10 @@ def doctor(folder: str = ".") -> int:
     return 1 if missing else 0
 
 
-def exit_code(report: "xr.Dataset", fail_on: str, otherwise: int) -> int:
-    """Return 3 if a shape of a report has a status that --fail-on names, or a worse one."""
+def exit_code(statuses: "list[Any]", fail_on: str, otherwise: int) -> int:
+    """Return 3 if a shape has the status that --fail-on names, or is excluded with "flagged"."""
     failed = {"none": [], "excluded": ["excluded"], "flagged": ["flagged", "excluded"]}[fail_on]
-    return 3 if report["status"].isin(failed).any() else otherwise
+    return 3 if any(status.isin(failed).any() for status in statuses) else otherwise
 
 
 def run(
@@ -85,7 +85,7 @@ def run(
     cluster : ADDRESS
         dask scheduler tcp://host:port, or local:N worker processes
     fail_on
-        end with exit code 3 if shapes were excluded, or if shapes were flagged or excluded
+        end with exit code 3 if shapes are excluded, or if shapes are flagged or excluded
 
     Examples
     --------
@@ -101,7 +101,7 @@ def run(
     lines = [tables.report_table(report), *tables.cost_lines(report)]
     full.write_text("\n".join(lines) + "\n", encoding="utf-8")
     write(tables.run_summary(study, again=again), *tables.place_lines(out, str(full)))
-    return exit_code(report, fail_on, 1 if study["report"].attrs["unforeseen"] else 0)
+    return exit_code([report["status"]], fail_on, 1 if study["report"].attrs["unforeseen"] else 0)
 
 
 @contextlib.contextmanager
@@ -384,7 +384,7 @@ def insert(
     reflect : NAMES
         new shapes to mirror: names separated by commas; or auto, those mirrored to the study
     fail_on
-        end with exit code 3 if shapes were excluded, or if shapes were flagged or excluded
+        end with exit code 3 if shapes are excluded, or if shapes are flagged or excluded
     """
     tree = s4a.open_study(study)
     given = {"landmarks": landmarks, "reflect": reflect, "n_jobs": n_jobs} | system
@@ -394,8 +394,8 @@ def insert(
     s4a.write_registered(inserted, folder)
     write(tables.inserted_table(inserted), "")
     write(f"written: {path}, registered meshes and scores in {folder}")
-    report = inserted["report"].to_dataset()
-    return exit_code(report, fail_on, 1 if (report["status"] == "excluded").any() else 0)
+    status = inserted["report"]["status"]
+    return exit_code([status], fail_on, 1 if (status == "excluded").any() else 0)
 
 
 def transfer(
@@ -422,7 +422,7 @@ def transfer(
         labels of the source's vertices: NPY, NPZ (FILE:NAME), CSV, GIFTI label or FreeSurfer
         annot, also .gz
     source_landmarks : FILE
-        landmarks and curves of the source: Slicer .mrk.json, CSV or MeshLab .pp
+        landmarks and curves of the source: Slicer .mrk.json or .fcsv, CSV, TPS, .pts or MeshLab .pp
     out : FOLDER
         folder for <target>.labels.npy, .confidence.npy, .landmarks.csv
     blur : X
@@ -436,11 +436,13 @@ def transfer(
     into_study = len(targets) == 1 and any(Path(targets[0]).glob("**/registration.nc"))
     if into_study:
         s4a.study.store.check_is_study(Path(targets[0]))
-    mesh, label, points = s4a.read_shape(source), None, None
+    system = {name: options[name] for name in SYSTEM}
+    mesh, label, points = s4a.read_shape(source, **system), None, None
     if labels:
         label = labels_in(labels, mesh)
     if source_landmarks:
         points = s4a.input.annotations.read_landmarks(source_landmarks)
+        points = s4a.input.coordinates.with_system(points, **system)
         distance = s4a.input.landmarks.locate(points, mesh)["landmark_distance"].values
         far = f"at most {distance.max():.3g} from the surface of {source}"
         write(f"{len(distance)} landmarks, {far}")
@@ -554,7 +556,7 @@ def compare(
         source vertex (from 0; -1 for none), or its x, y, z
     landmarks : PATH
         landmark files of the source and of each target, whose common names guide registration:
-        Slicer .mrk.json, CSV or MeshLab .pp
+        Slicer .mrk.json or .fcsv, CSV, TPS, .pts or MeshLab .pp
     keep
         also write meshes, matches and maps to compare.nc, for s4a.widgets.Comparison
     out : FOLDER
@@ -628,8 +630,8 @@ def compare_pairs(
 
 def landmark_pairs(
     files: list[str] | None, targets: list[str]
-) -> "dict[str, list[np.ndarray]] | None":
-    """Return the positions of the landmarks that the source and each target have in common."""
+) -> "dict[str, list[xr.Dataset]] | None":
+    """Return the landmarks that the source and each target have in common."""
     if not files:
         return None
     if len(files) != 1 + len(targets):
@@ -637,20 +639,18 @@ def landmark_pairs(
             "--landmarks needs a file for the source and each target, "
             f"{1 + len(targets)}; found {len(files)}"
         )
-    source, *others = (
-        s4a.input.annotations.read_landmarks(file).set_index(landmark="landmark_name")
-        for file in files
-    )
+    source, *others = map(s4a.input.annotations.read_landmarks, files)
     pairs = {}
     for name, file, target in zip(targets, files[1:], others, strict=True):
-        both = [mark for mark in source["landmark"].values if mark in target["landmark"]]
+        names_of = [marks["landmark_name"].values.tolist() for marks in (source, target)]
+        both = [mark for mark in names_of[0] if mark in names_of[1]]
         if len(both) < 3:
             raise ValueError(
                 f"{files[0]} and {file} need 3 landmarks or more of the same names, "
                 f"found {len(both)}"
             )
-        ends = (source.sel(landmark=both), target.sel(landmark=both))
-        pairs[name] = [end["landmark_position"].values for end in ends]
+        at = [[own.index(mark) for mark in both] for own in names_of]
+        pairs[name] = [source.isel(landmark=at[0]), target.isel(landmark=at[1])]
     return pairs
 
 

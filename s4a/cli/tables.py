@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import lazy_loader
 
 import s4a
-from s4a.input.raw import sentences
 
 if TYPE_CHECKING:
     import numpy as np
@@ -350,7 +349,9 @@ def excluded_lines(report: "xr.Dataset", most: int) -> list[str]:
 
 def sentence_lines(head: str, text: str) -> list[str]:
     """Return a head and the first sentences of a text, one at least, in lines of a screen."""
-    return wrapped(f"{head}{sentences(text, SCREEN - len(head))}", SCREEN, "", " " * len(head))
+    return wrapped(
+        f"{head}{s4a.input.raw.sentences(text, SCREEN - len(head))}", SCREEN, "", " " * len(head)
+    )
 
 
 def short_reason(reason: str, path: str) -> str:

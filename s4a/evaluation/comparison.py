@@ -33,6 +33,7 @@ from s4a.evaluation.methods import (
 from s4a.geometry.align import align, realign, relative_transform
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.collection import Mesh, as_mesh, read_shapes
+from s4a.input.landmarks import locate
 from s4a.input.raw import content, npy, shown, text_of
 from s4a.method import latent, median, network
 from s4a.method.initial_map import map_after_alignment
@@ -50,6 +51,7 @@ __all__ = ["COLLECTION_METHODS", "METHODS", "compare", "compare_collection"]
 COLLECTION_METHODS = ("SCALABLE", "RE-MATCH")
 COLLECTION_BLOCKS = BLOCKS[0], "basis and initial maps", "consistent ZoomOut", BLOCKS[-1]
 DENSE_MATCHES = ("fmap", "latent")
+FARTHEST = 0.1  # of a landmark, as a share of sqrt(area): meshes that are compared may be coarse
 # iterations of RE-MATCH refined, and initial maps of all methods
 PRESETS: dict[str | None, dict[str, Any]] = {
     None: {"full_resolution_iterations": 2, "init": "landmarks"},
@@ -363,10 +365,13 @@ def stacked(maps: list[np.ndarray | None]) -> np.ndarray:
 def landmarks_of(given: Any, source: Spaces, target: Spaces, clean: bool) -> Matches:
     """Return landmarks as vertices of both meshes.
 
-    Positions ``(p, 3)`` give the nearest vertices, rows of files those of the clean meshes.
+    Positions ``(p, 3)``, or those of a Dataset of :func:`s4a.input.annotations.read_landmarks`,
+    give the nearest vertices, rows of files those of the clean meshes.
     """
     ends: list[np.ndarray] = []
     for marks, space in zip(given, (source, target), strict=True):
+        if isinstance(marks, xr.Dataset):
+            marks = locate(marks, space.mesh, farthest=FARTHEST)["landmark_position"]
         v = np.asarray(marks)
         if v.ndim == 2 and v.shape[1] == 3:
             v = cKDTree(space.mesh["position"].values).query(v)[1]

@@ -364,11 +364,11 @@ def poses(source: Cloud, target: Cloud) -> list[IcpResult]:
     """
     starts = initial_transforms(source, target)
     if len(starts) > N_POSES:
-        few, few_target = (
+        few, fixed = (
             c._replace(paired=c.paired[farthest_points(c.X[c.paired], N_ROUGH)])
             for c in (source, target)
         )
-        ends = icp_each(few, few_target, starts, tolerance=1e-3, iterations=15)
+        ends = icp_each(few, fixed, starts, tolerance=1e-3, iterations=15)
         starts = [(R, t) for R, t, _ in distinct(ends)[:N_POSES]]
     return distinct(icp_each(source, target, starts, tolerance=ROUGH))
 

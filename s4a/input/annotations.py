@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from s4a.input.coordinates import CoordinateSystem
+from s4a.input.coordinates import CoordinateSystem, map_between, moved
 from s4a.input.files import stem_of
 from s4a.input.formats import gifti_arrays, ply_properties
 from s4a.input.raw import check_there, content, npy, npz, reading, shown, text_of, xml
@@ -365,7 +365,7 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
 
 def _specimen(text, name):
     """Lines of one specimen of a TPS file."""
-    specimens = re.split(r"(?im)^\s*(?=LM3?\s*=)", text)[1:]
+    specimens = re.split(r"(?im)^(?=[ \t]*LM3?\s*=)", text)[1:]
     ids = [
         found[1] if (found := re.search(r"(?im)^ID\s*=\s*(.*?)\s*$", s)) else "" for s in specimens
     ]
@@ -490,8 +490,8 @@ def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
     """Write landmarks as CSV or, if the name ends in ``.mrk.json``, as markups of 3D Slicer.
 
     CSV has the columns ``name,x,y,z``, and ``curve,closed`` for curves.  Markups have a list of
-    points and a list for each curve; they are in RAS if the attribute ``coordinate_system`` of the
-    landmarks is, else in LPS, the default of 3D Slicer.
+    points and a list for each curve, in the axes of the attribute ``coordinate_system`` of the
+    landmarks, else in LPS, the default of 3D Slicer.  Surface RAS becomes scanner RAS.
     """
     require(landmarks, "landmark_name", "landmark_position", what="landmarks")
     if Path(path).name.lower().endswith(".mrk.json"):
@@ -509,17 +509,20 @@ def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
 
 def _markups(landmarks):
     """Content of a file of markups, as 3D Slicer writes it."""
-    system = CoordinateSystem.of(landmarks.attrs).axes or "LPS"
     unit = unit_of(landmarks["landmark_position"])
-    frame = {"coordinateSystem": system} | ({"coordinateUnits": unit} if unit == "mm" else {})
-    upright = 1.0 if system == "RAS" else -1.0  # the axes of a point are those of RAS
+    own = CoordinateSystem.of(landmarks.attrs | ({"unit": unit} if unit in MILLIMETRES else {}))
+    written = own.in_world("LPS" if own.axes == "LPS" else "RAS", "mm")
+    M = map_between(own, written, "landmarks")
+    frame = {"coordinateSystem": written.axes or "LPS"}
+    frame |= {"coordinateUnits": "mm"} if written.unit else {}
+    upright = 1.0 if written.axes == "RAS" else -1.0  # the axes of a point are those of RAS
     n = landmarks.sizes["landmark"]
     curves = landmarks["landmark_curve"].values if "landmark_curve" in landmarks else np.full(n, "")
     closed = (
         landmarks["landmark_closed"].values if "landmark_closed" in landmarks else np.zeros(n, bool)
     )
     names = landmarks["landmark_name"].values.tolist()
-    positions = landmarks["landmark_position"].values.astype(float).tolist()
+    positions = moved(landmarks["landmark_position"].values.astype(float), M).tolist()
     orientation = [upright, 0.0, 0.0, 0.0, upright, 0.0, 0.0, 0.0, 1.0]
     shared = {"orientation": orientation, "selected": True, "locked": False, "visibility": True}
     points = [

@@ -277,8 +277,8 @@ def _rows_of(table, column, value):
     if missing:
         raise ValueError(f"reflect: the column {column!r} has no value for {listed(missing)}")
     if value is not None:
-        cells = np.array(list(words.values()))
-        check_column(cells, list(words), f"reflect, column {column!r}", categories=True)
+        texts = np.array(list(words.values()))
+        check_column(texts, list(words), f"reflect, column {column!r}", categories=True)
         if value not in words.values():
             raise ValueError(
                 f"reflect: no shape has {value!r} in the column {column!r}, which has "

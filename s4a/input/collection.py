@@ -1,5 +1,6 @@
 """Collections of shapes (5.1, the data): read and clean every file, and report on all."""
 
+import logging
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -24,8 +25,10 @@ from s4a.input.files import (
 from s4a.input.labels import Label, read_volume
 from s4a.input.plausibility import examine
 from s4a.input.raw import shown
-from s4a.options import check, check_label
+from s4a.options import Options, check, check_label
 from s4a.schema import check_type, dataset, in_unit, require
+
+log = logging.getLogger(__name__)
 
 # columns of the report
 COUNTS = [
@@ -111,6 +114,20 @@ def as_mesh(shape: Mesh, what: str = "mesh") -> xr.Dataset:
     check_type(shape, xr.Dataset | xr.DataTree, what, expected)
     require(shape, "position", "corner_vertex", what=what)
     return shape
+
+
+def as_meshes(shapes: dict[str, Mesh], options: Options) -> dict[str, xr.Dataset]:
+    """Return meshes, or those of files, in one coordinate system if all are known.
+
+    The `options` say what the files do not.
+    """
+    given = options.coordinate_system, options.unit
+    meshes = {n: with_system(as_mesh(one, n), *given) for n, one in shapes.items()}
+    try:
+        return in_one_system(meshes)
+    except ValueError as error:  # each is matched in its own coordinates
+        log.warning("%s", error)
+        return meshes
 
 
 def read_shapes(

@@ -1,14 +1,14 @@
 """Coordinate systems of files (5.1, the data): read, compare and convert.
 
 A system has axes, an origin and a unit.  It is stored as the attributes ``coordinate_system``, a
-text such as those of :data:`EXAMPLES`, and ``unit``.  Everything that combines files asks
+text such as those in :data:`EXAMPLES`, and ``unit``.  Everything that combines files asks
 :func:`transform`, which is None if what is needed is unknown.
 """
 
 import re
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import permutations, product
 from typing import Any, Self
 
 import numpy as np
@@ -19,15 +19,15 @@ from s4a.input.raw import xml
 from s4a.options import MILLIMETRES
 from s4a.schema import in_unit
 
+# RAS and LPS: world coordinates of an image, as 3D Slicer and most programs use them; surface RAS:
+# FreeSurfer's, adding c_ras gives scanner RAS; any other word is the name of a template space
 EXAMPLES = (
-    "RAS",  # world coordinates of an image, as 3D Slicer and most programs use them
-    "LPS",
-    "scanner RAS",
-    "surface RAS, c_ras 1.5 -20 35",  # FreeSurfer's; adding c_ras gives scanner RAS
-    "MNI152 RAS",  # any other word is the name of a template space
-    "RAS, origin unknown",
+    "RAS, LPS, scanner RAS, 'surface RAS, c_ras 1.5 -20 35', MNI152 RAS, 'RAS, origin unknown'"
 )
-OPPOSITE = dict(zip("RLAPSI", "LRPAIS", strict=True))
+AXES = {"".join(axes) for one in product("RL", "AP", "SI") for axes in permutations(one)}
+TEXT = re.compile(
+    r"(?:(\S+) )?(...)(?:, (?:c_ras|to scanner RAS)((?: [-+.\de]+)+))?(, origin unknown)?"
+)
 SURFACE, UNKNOWN = "surface", "unknown"
 XFORMS = {1: "scanner", 3: "Talairach", 4: "MNI152", 5: "template"}  # codes of NIfTI; 2 is world
 SPACES = {"SCANNER_ANAT": 1, "ALIGNED_ANAT": 2, "TALAIRACH": 3, "MNI_152": 4}  # of GIFTI
@@ -50,14 +50,14 @@ class CoordinateSystem:
         surface RAS, ``unknown``, or the name of a template space.
     unit : str
         A key of :data:`s4a.options.MILLIMETRES`; empty if unknown.
-    to_world : tuple of 12 floats, optional
+    to_scanner : tuple of 12 floats, optional
         The affine map (3, 4) of surface RAS to scanner RAS, in millimetres.
     """
 
     axes: str = ""
     origin: str = ""
     unit: str = ""
-    to_world: tuple[float, ...] | None = None
+    to_scanner: tuple[float, ...] | None = None
 
     @classmethod
     def of(cls, attrs: Mapping[Any, Any], prefix: str = "") -> Self:
@@ -70,43 +70,36 @@ class CoordinateSystem:
 
         Examples
         --------
-        >>> from s4a.input.coordinates import EXAMPLES, CoordinateSystem
-        >>> systems = [CoordinateSystem.of({"coordinate_system": text}) for text in EXAMPLES]
-        >>> [system.attrs["coordinate_system"] for system in systems] == list(EXAMPLES)
-        True
+        >>> from s4a.input.coordinates import CoordinateSystem
+        >>> text = "surface RAS, c_ras 1.5 -20 35"
+        >>> system = CoordinateSystem.of({"coordinate_system": text, "unit": "mm"})
+        >>> system.axes, system.origin, str(system)
+        ('RAS', 'surface', 'surface RAS, c_ras 1.5 -20 35, mm')
         """
-        text = str(attrs.get(f"{prefix}coordinate_system") or "")
-        unit = str(attrs.get(f"{prefix}unit") or "")
-        words = re.fullmatch(r"(?:(\S+) )?([A-Z]{3})(?:, (origin unknown|[\w ]+ [-+\d].*))?", text)
+        text, unit = (str(attrs.get(prefix + key) or "") for key in ("coordinate_system", "unit"))
         if not text:
             return cls(unit=unit)
-        if not words or {min(axis, OPPOSITE[axis]) for axis in words[2] if axis in OPPOSITE} != {
-            *"LAI"
-        }:
-            raise ValueError(
-                f"a coordinate system such as {'; '.join(EXAMPLES)} needed, found {text!r}"
-            )
-        origin, numbers = words[1] or "", None
-        if words[3] == "origin unknown":
-            origin = UNKNOWN
-        elif words[3]:
-            numbers = affine_of(words[3])
-        return cls(words[2], origin, unit, numbers)
+        words = TEXT.fullmatch(text)
+        numbers = words[3].split() if words and words[3] else []
+        M = np.array(numbers, float).reshape(3, -1) if len(numbers) in (3, 12) else np.eye(3, 4)
+        M = np.column_stack([np.eye(3), M]) if len(numbers) == 3 else M
+        fits = len(numbers) in (0, 3, 12) and abs(np.linalg.det(M[:, :3])) > 1e-9
+        if not words or words[2] not in AXES or not fits:
+            raise ValueError(f"one coordinate system of {EXAMPLES} needed, found {text!r}")
+        to_scanner = tuple(M.ravel().tolist()) if numbers else None
+        return cls(words[2], UNKNOWN if words[4] else words[1] or "", unit, to_scanner)
 
     @property
     def attrs(self) -> dict[str, str]:
         """Attributes of a mesh, without those that are unknown."""
-        text = self.axes
+        text = f"{self.origin} {self.axes}".strip()
         if self.origin == UNKNOWN:
-            text += ", origin unknown"
-        elif self.origin:
-            text = f"{self.origin} {text}"
-        if self.to_world:
-            M = np.reshape(self.to_world, (3, 4))
+            text = f"{self.axes}, origin unknown"
+        if self.to_scanner:
+            M = np.reshape(self.to_scanner, (3, 4))
             is_offset = np.array_equal(M[:, :3], np.eye(3))
-            numbers = M[:, 3] if is_offset else M.ravel()
-            text += ", c_ras " if is_offset else ", to scanner RAS "
-            text += " ".join(f"{x:.9g}" for x in numbers)
+            numbers = " ".join(f"{x:.9g}" for x in (M[:, 3] if is_offset else M.ravel()))
+            text += f", {'c_ras' if is_offset else 'to scanner RAS'} {numbers}"
         return {k: v for k, v in {"coordinate_system": text, "unit": self.unit}.items() if v}
 
     @property
@@ -121,40 +114,21 @@ class CoordinateSystem:
 
     def filled(self, given: Self) -> Self:
         """Return the system with what it leaves open as in another one."""
-        if not self.axes:
-            return replace(given, unit=self.unit or given.unit)
-        place = given if self.origin == UNKNOWN and given.axes else self
-        if self.origin == SURFACE == given.origin and not self.to_world:
-            place = given
-        unit = self.unit or given.unit
-        return replace(self, origin=place.origin, to_world=place.to_world, unit=unit)
+        unit, both = self.unit or given.unit, self.axes and given.axes
+        is_open = self.origin == UNKNOWN or (
+            self.origin == SURFACE == given.origin and not self.to_scanner
+        )
+        place = given if not self.axes or (both and is_open) else self
+        return replace(place, axes=self.axes or given.axes, unit=unit)
 
     def in_world(self, axes: str = "", unit: str = "") -> Self:
         """Return the system of the scan, for files that cannot store c_ras.
 
         Axes and unit are those of the system, unless others are given and the system is known.
         """
-        system = replace(self, origin="scanner", to_world=None) if self.to_world else self
-        system = replace(system, axes=axes or system.axes) if system.axes else system
-        return replace(system, unit=unit or system.unit) if system.unit in MILLIMETRES else system
-
-
-def affine_of(text: str) -> tuple[float, ...]:
-    """Return the twelve numbers of ``c_ras x y z`` or ``to scanner RAS``."""
-    try:
-        numbers = [float(word) for word in re.findall(r"[-+\d][-+.\deE]*(?= |$)", text)]
-        M = np.reshape(numbers, (3, -1))
-        M = np.column_stack([np.eye(3), M]) if M.shape == (3, 1) else M
-        if M.shape != (3, 4) or abs(np.linalg.det(M[:, :3])) < 1e-12 or not np.isfinite(M).all():
-            raise ValueError
-    except ValueError as error:
-        raise ValueError(
-            f"c_ras and three numbers, or a map to scanner RAS and twelve, needed, found {text!r}"
-        ) from error
-    return tuple(M.ravel().tolist())
-
-
-# conversion
+        axes, unit = self.axes and (axes or self.axes), self.unit and (unit or self.unit)
+        place = "scanner" if self.to_scanner else self.origin
+        return replace(self, axes=axes, origin=place, unit=unit, to_scanner=None)
 
 
 def transform(
@@ -180,37 +154,24 @@ def transform(
     units = {source.unit, target.unit}
     if bool(source.axes) != bool(target.axes) or (len(units) > 1 and not units <= {*MILLIMETRES}):
         return None
-    same = (source.origin, source.to_world) == (target.origin, target.to_world)
-    A, B = (linear(system, len(units) > 1) for system in (source, target))
+    same = (source.origin, source.to_scanner) == (target.origin, target.to_scanner)
     if origin and not same:
-        places = {"scanner" if s.to_world else s.origin for s in (source, target)}
+        places = {"scanner" if s.to_scanner else s.origin for s in (source, target)}
         if places & {UNKNOWN, SURFACE} or len(places - {""}) > 1:
             return None
-        A, B = (world(s, len(units) > 1) @ M for s, M in ((source, A), (target, B)))
+    A, B = (map_to_ras(system, placed=origin and not same) for system in (source, target))
     return np.linalg.solve(B, A)
 
 
-def linear(system: CoordinateSystem, scaled: bool) -> np.ndarray:
-    """Return the map (4, 4) of a system to the axes RAS and, if `scaled`, to millimetres."""
+def map_to_ras(system: CoordinateSystem, *, placed: bool) -> np.ndarray:
+    """Return the map (4, 4) of a system to RAS in mm, if `placed` of the scanner."""
     M = np.eye(4)
-    for row, positive in enumerate("RAS" if system.axes else ""):
-        M[row, :3] = [(a == positive) - float(a == OPPOSITE[positive]) for a in system.axes]
-    M[:3] *= MILLIMETRES[system.unit] if scaled else 1.0
+    for row, ends in enumerate(("RL", "AP", "SI") if system.axes else ()):
+        M[row, :3] = [{ends[0]: 1.0, ends[1]: -1.0}.get(axis, 0.0) for axis in system.axes]
+    M[:3] *= MILLIMETRES.get(system.unit, 1.0)
+    if placed and system.to_scanner:
+        return np.reshape([*system.to_scanner, 0, 0, 0, 1], (4, 4)) @ M
     return M
-
-
-def world(system: CoordinateSystem, scaled: bool) -> np.ndarray:
-    """Return the map (4, 4) of surface RAS to scanner RAS; the identity for other systems."""
-    M = np.eye(4)
-    if system.to_world:
-        M[:3] = np.reshape(system.to_world, (3, 4))
-        M[:3, 3] /= 1.0 if scaled else MILLIMETRES.get(system.unit, 1.0)
-    return M
-
-
-def moved(X: np.ndarray, M: np.ndarray) -> np.ndarray:
-    """Apply an affine map (4, 4) to points ``(n, 3)``; the identity leaves every bit."""
-    return X if np.array_equal(M, np.eye(4)) else X @ M[:3, :3].T + M[:3, 3]
 
 
 def map_between(source: CoordinateSystem, target: CoordinateSystem, what: str) -> np.ndarray:
@@ -238,28 +199,35 @@ def common(systems: Mapping[str, CoordinateSystem], *, origin: bool = False) -> 
     ValueError
         If a system cannot be converted to another; the message names both, with the shapes.
     """
-    axes = {n: s if origin else CoordinateSystem(s.axes, "", s.unit) for n, s in systems.items()}
-    groups = {s: [n for n in axes if axes[n] == s] for s in axes.values()}
+    own = {n: s if origin else CoordinateSystem(s.axes, "", s.unit) for n, s in systems.items()}
+    groups = {s: [n for n in own if own[n] == s] for s in own.values()}
     if any(transform(a, b) is None for a in groups for b in groups):
-        texts = [f"{system}: {', '.join(names[:6])}" for system, names in groups.items()]
+        texts = "; ".join(f"{system}: {', '.join(names[:6])}" for system, names in groups.items())
         raise ValueError(
-            "coordinate systems that can be converted to each other needed, found "
-            f"{'; '.join(texts)}: {REMEDY}"
+            f"coordinate systems that convert to each other needed, found {texts}: {REMEDY}"
         )
-    return Counter(axes.values()).most_common(1)[0][0] if axes else CoordinateSystem()
+    return max(groups, key=lambda system: len(groups[system]), default=CoordinateSystem())
+
+
+# meshes
+
+
+def moved(X: np.ndarray, M: np.ndarray) -> np.ndarray:
+    """Apply an affine map (4, 4) to points ``(n, 3)``; the identity leaves every bit."""
+    return X if np.array_equal(M, np.eye(4)) else X @ M[:3, :3].T + M[:3, 3]
+
+
+def turned(T: np.ndarray, M: np.ndarray) -> np.ndarray:
+    """Return triangles ``(m, 3)`` in the order in which they face outward after a map (4, 4)."""
+    return np.ascontiguousarray(T[:, ::-1]) if np.linalg.det(M) < 0 else T
 
 
 def transformed(mesh: xr.Dataset, M: np.ndarray) -> xr.Dataset:
     """Apply an affine map (4, 4) to a mesh and its landmarks; normals stay outward."""
-    image = mesh.copy()
-    for name in ("position", "landmark_position", "guide_position"):
-        if name in mesh:
-            image[name] = mesh[name].copy(data=moved(mesh[name].values, M))
-    if np.linalg.det(M) < 0:
-        for name in ("corner_vertex", "landmark_barycentric", "guide_barycentric"):
-            if name in mesh:
-                image[name] = mesh[name].copy(data=np.ascontiguousarray(mesh[name].values[:, ::-1]))
-    return image
+    apply: dict[str, Any] = {f"{name}position": moved for name in ("", "landmark_", "guide_")}
+    apply |= dict.fromkeys(("corner_vertex", "landmark_barycentric", "guide_barycentric"), turned)
+    found = {name: mesh[name] for name in apply if name in mesh}
+    return mesh.assign({n: v.copy(data=apply[n](v.values, M)) for n, v in found.items()})
 
 
 def file_system(attrs: Mapping[Any, Any]) -> CoordinateSystem:
@@ -276,30 +244,37 @@ def with_system(mesh: xr.Dataset, coordinate_system: str | None, unit: str | Non
     return mesh.assign_attrs(CoordinateSystem.of(mesh.attrs).filled(given).attrs)
 
 
+def says_nothing(mesh: xr.Dataset) -> bool:
+    """Return whether a mesh is given in memory without axes and unit; it is never converted."""
+    system = CoordinateSystem.of(mesh.attrs)
+    return not (system.axes or system.unit or mesh.attrs.get("path"))
+
+
 def in_axes(mesh: xr.Dataset, target: CoordinateSystem, what: str = "a mesh") -> xr.Dataset:
     """Convert axes and unit of a mesh; the attribute ``reason`` records it.
 
     Raises ValueError if axes or unit of the mesh, or of the target, are unknown.
     """
     system = CoordinateSystem.of(mesh.attrs)
-    if (system.axes, system.unit) == (target.axes, target.unit):
+    if (system.axes, system.unit) == (target.axes, target.unit) or says_nothing(mesh):
         return mesh
     common({what: system, "the others": target})
     new = replace(system, axes=target.axes, unit=target.unit)
-    M = transform(system, new)
-    image = transformed(mesh, M) if M is not None else mesh
-    factor = MILLIMETRES.get(system.unit, 1.0) / MILLIMETRES.get(new.unit, 1.0)
-    image.attrs |= {f"file_{name}": text for name, text in system.attrs.items()} | new.attrs
-    reasons = [mesh.attrs.get("reason", ""), f"converted from {system} to {new}"]
-    image.attrs["reason"] = "; ".join(filter(None, reasons))
+    M = map_between(system, new, what)
+    image = transformed(mesh, M)
+    reasons = filter(None, [mesh.attrs.get("reason"), f"converted from {system} to {new}"])
+    file = file_system(mesh.attrs).attrs
+    image.attrs |= {f"file_{name}": text for name, text in file.items()} | new.attrs
+    image.attrs["reason"] = "; ".join(reasons)
     if "area" in mesh.attrs:
-        image.attrs["area"] *= factor**2
+        image.attrs["area"] *= abs(np.linalg.det(M)) ** (2 / 3)
     return in_unit(image, new.unit, of=system.unit)
 
 
 def in_one_system(meshes: Mapping[str, xr.Dataset]) -> dict[str, xr.Dataset]:
     """Return meshes in one system of axes and one unit, see :func:`common`."""
-    target = common({name: CoordinateSystem.of(mesh.attrs) for name, mesh in meshes.items()})
+    said = {name: mesh for name, mesh in meshes.items() if not says_nothing(mesh)}
+    target = common({name: CoordinateSystem.of(mesh.attrs) for name, mesh in said.items()})
     return {name: in_axes(mesh, target, name) for name, mesh in meshes.items()}
 
 
@@ -321,7 +296,7 @@ def system_in(data: bytes, kind: str) -> CoordinateSystem:
         return _of_gifti(data)
     if kind == "MNI":
         return CoordinateSystem("RAS", "", "mm")
-    # 3D Slicer writes this into the title or a comment of any file, and into fields of VTK files
+    # 3D Slicer, whose unit is mm, writes SPACE into a title or comment, or into fields of VTK files
     head = data[:1000]
     space = re.search(rb"SPACE=([RLAPSI]{3})\b", head)
     unit = re.search(rb"UNIT=(um|mm|cm|m|in)\b", head)
@@ -331,8 +306,9 @@ def system_in(data: bytes, kind: str) -> CoordinateSystem:
         axes = field[1].decode() if field else ""
     if kind == "VTP" and not space and b"SPACE" in data:
         axes = next(iter(VtkXml(data).strings("SPACE")), "")
+    axes = axes if axes in AXES else ""
     origin = UNKNOWN if b" ORIGIN=unknown" in head else ""
-    default = "mm" if axes and (not space or b"Slicer" in head) else ""
+    default = "mm" if axes and b"S4A SPACE" not in head else ""
     return CoordinateSystem(axes, origin, unit[1].decode() if unit else default)
 
 
@@ -348,41 +324,41 @@ def _of_freesurfer(data):
     }
     if len(numbers) < 4 or not re.search(rb"valid = 1\b", footer):
         return CoordinateSystem("RAS", SURFACE, "mm")
-    return surface_system(*(numbers[f"{axis}ras"] for axis in "xyzc"))
+    return _of_volume(*(numbers[f"{axis}ras"] for axis in "xyzc"))
 
 
-def surface_system(x: Any, y: Any, z: Any, c: Any) -> CoordinateSystem:
-    """Return surface RAS of a volume with the directions x, y and z and the centre c."""
-    # voxel axes of the conformed volume, which surface RAS follows: left, inferior, anterior
+def surface_system(M: Any) -> CoordinateSystem:
+    """Return surface RAS with its map (3, 4) to scanner RAS."""
+    numbers = " ".join(map(repr, (np.asarray(M, float) + 0.0).ravel().tolist()))
+    return CoordinateSystem.of(
+        {"coordinate_system": f"surface RAS, to scanner RAS {numbers}", "unit": "mm"}
+    )
+
+
+def _of_volume(x, y, z, c):
+    """Surface RAS of a volume with the directions x, y and z and the centre c."""
+    # surface RAS has the axes of voxels, which it takes to be those of the conformed volume
     R = np.column_stack([x, y, z]) @ np.array([[-1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3):
-        raise ValueError("perpendicular directions of a volume needed in its geometry")
-    numbers = tuple((np.column_stack([R, c]) + 0.0).ravel().tolist())
-    return CoordinateSystem("RAS", SURFACE, "mm", numbers)
+    return surface_system(np.column_stack([R, c]))
 
 
 def _of_gifti(data):
     """RAS in mm; the space of the points, their map to scanner RAS, or FreeSurfer's VolGeom."""
-    unknown = CoordinateSystem("RAS", UNKNOWN, "mm")
-    points = [a for a in xml(data).iter("DataArray") if "POINTSET" in a.get("Intent", "")]
-    if not points:
-        return unknown
-    codes = {}
-    for node in points[0].iter("CoordinateSystemTransformMatrix"):
+    root, maps = xml(data), {}
+    for node in root.iter("CoordinateSystemTransformMatrix"):
         texts = [node.findtext(tag) or "" for tag in ("DataSpace", "TransformedSpace")]
         here, there = (SPACES.get(t.strip().removeprefix("NIFTI_XFORM_"), 0) for t in texts)
-        codes[here, there] = [float(word) for word in (node.findtext("MatrixData") or "").split()]
-    known = [here for here, _ in codes if here]
-    if known:
-        return replace(unknown, origin=XFORMS.get(known[0], ""))
-    meta = {m.findtext("Name"): m.findtext("Value") for m in points[0].iter("MD")}
+        if here:
+            return CoordinateSystem("RAS", XFORMS.get(here, ""), "mm")
+        maps[there] = (node.findtext("MatrixData") or "").split()
+    meta = {m.findtext("Name"): m.findtext("Value") for m in root.iter("MD")}
     geometry = [[meta.get(f"VolGeom{a}_{b}") for b in "RAS"] for a in "XYZC"]
     if all(word for row in geometry for word in row):
-        return surface_system(*np.array(geometry, float))
-    for (_, there), numbers in codes.items():
-        if there in (1, 2) and len(numbers) == 16:
-            return replace(unknown, origin=SURFACE, to_world=tuple(numbers[:12]))
-    return unknown
+        return _of_volume(*np.array(geometry, float))
+    to_scanner = maps.get(1, maps.get(2, ()))
+    if len(to_scanner) == 16:
+        return surface_system(to_scanner[:12])
+    return CoordinateSystem("RAS", UNKNOWN, "mm")
 
 
 def nifti_system(code: int) -> CoordinateSystem:

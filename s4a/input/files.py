@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from s4a.input.coordinates import CoordinateSystem, map_between, moved, system_in
+from s4a.input.coordinates import CoordinateSystem, map_between, moved, system_in, turned
 from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
 from s4a.input.labels import VOLUMES, grid_of, volume_format
 from s4a.input.polygons import triangulated
@@ -175,7 +175,7 @@ def write_mesh(
     *,
     coordinate_system: str = "",
     unit: str = "",
-    **vertex_scalars: np.ndarray,
+    **vertex_scalars: Any,
 ) -> None:
     """Write a mesh file in the format of its suffix.
 
@@ -230,8 +230,9 @@ def write_mesh(
     system = CoordinateSystem.of({"coordinate_system": coordinate_system, "unit": unit})
     written = system.in_world(*["RAS", "mm"] if suffix == ".gii" else [])
     M = map_between(system, written, shown(path))
-    triangles = triangles[:, ::-1] if np.linalg.det(M) < 0 else triangles
-    path.write_bytes(WRITERS[suffix](moved(points, M), triangles, scalars, written.title))
+    path.write_bytes(
+        WRITERS[suffix](moved(points, M), turned(triangles, M), scalars, written.title)
+    )
 
 
 # the files of a collection

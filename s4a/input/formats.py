@@ -27,7 +27,6 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
-from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -243,7 +242,10 @@ def _parse_vtp(data):
     file = VtkXml(data)
     points, cells, n_before = [np.empty((0, 3))], [], 0
     for piece in file.root.iter("Piece"):
-        X = file.values(piece.find("Points/DataArray")).reshape(-1, 3)
+        node = piece.find("Points/DataArray")
+        if node is None:
+            raise ValueError("an array of points expected, found none")
+        X = file.values(node).reshape(-1, 3)
         counts = {"NumberOfPoints": len(X)}
         for name in ("Polys", "Strips"):
             arrays = {"connectivity": np.empty(0, np.int64), "offsets": np.empty(0, np.int64)}
@@ -283,7 +285,7 @@ class VtkXml:
         self.size_type = np.dtype(self.order + ("u8" if is_64_bit else "u4"))
         self.compressor = self.root.get("compressor")
 
-    def values(self, node: Element) -> np.ndarray:
+    def values(self, node: Any) -> np.ndarray:
         """Read the numbers of a DataArray."""
         return self._bytes(node, _number_type(node.get("type"), self.order))
 
@@ -301,13 +303,9 @@ class VtkXml:
 
     def strings(self, name: str) -> list[str]:
         """Strings of an array in the field data of the file, which are zero-terminated."""
-        nodes = [node for node in self.root.iter() if node.get("Name") == name]
-        return [
-            text.decode("latin-1")
-            for node in nodes
-            if node.get("type") == "String"
-            for text in self._bytes(node, np.dtype("u1")).tobytes().split(b"\0")
-        ]
+        nodes = self.root.iterfind(f".//*[@Name='{name}'][@type='String']")
+        texts = [self._bytes(node, np.dtype("u1")).tobytes() for node in nodes]
+        return [one.decode("latin-1") for text in texts for one in text.split(b"\0")]
 
     def _unpack(self, data, is_base64):
         """Bytes of one array: sizes come first, then the array or its compressed blocks."""
@@ -393,19 +391,19 @@ _MAGICS = {
     "a MATLAB file": rb"MATLAB \d",
     "a glTF file": rb"glTF|\s*\{.*\"asset\"\s*:",
     "a DICOM file": rb".{128}DICM",
-    "a MetaImage volume": rb"ObjectType\s*=",
-    "an FBX file": rb"Kaydara FBX",
-    "a Blender file": rb"BLENDER",
-    "a Gmsh file": rb"\$MeshFormat",
-    "a STEP file": rb"ISO-10303",
+    "a MetaImage or MRtrix volume": rb"ObjectType\s*=|mrtrix image",
+    "an FBX, Blender, Gmsh or STEP file": rb"Kaydara FBX|BLENDER|\$MeshFormat|ISO-10303",
     "a streamlines file": rb"TRACK\0|mrtrix tracks",
-    "an MRtrix image": rb"mrtrix image",
+    "values per vertex of FreeSurfer": rb"\xff{3}",
     "a BrainVISA mesh": rb"(ascii|binar)(DCBA|ABCD)",
     "a binary MNI surface": rb"p[\0-\xff]{3}[\x3c-\x3f]",
     "an NPY array": rb"\x93NUMPY",
     "a picture": rb"\x89PNG|\xff\xd8\xff|GIF8|II\*\0|MM\0\*",
     "a PDF file": rb"%PDF",
     "a compressed file": rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|\x28\xb5\x2f\xfd|Rar!",
+    "a pointer of Git LFS": rb"version https://git-lfs",
+    "a web page": rb"\s*<(![dD][oO][cC][tT][yY][pP][eE] )?(html|HTML)",
+    "a COLLADA or X3D file": rb"\s*<.{0,1000}<(COLLADA|X3D)\b",
     "a program": rb"\x7fELF|MZ[\x80-\xff]",
 }
 
@@ -432,13 +430,13 @@ def format_of(data: bytes) -> str:
         return "STL"
     if is_utf_16(data):
         raise ValueError("text in UTF-16 found: save it as UTF-8")
-    kind = next((kind for kind, magic in _MAGICS.items() if re.match(magic, data, re.DOTALL)), "")
-    if not kind and _is_binary_stl(data):
+    other = next((kind for kind, magic in _MAGICS.items() if re.match(magic, data, re.DOTALL)), "")
+    if not other and _is_binary_stl(data):
         return "STL"
-    if not kind and b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
+    if not other and b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
         return "OBJ"
     what = f"{len(data)} bytes" + " of an unknown format" * bool(data)
-    found = f"{kind}: export the surface as one of them" if kind else what
+    found = f"{other}: export the surface as one of them" if other else what
     raise ValueError(f"one of {', '.join(FORMATS)} expected, found {found}")
 
 
@@ -465,7 +463,7 @@ def _need(expected, found, what):
 
 # PLY
 
-_PLY_TYPES = {
+PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
     "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
     "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
@@ -542,7 +540,7 @@ def _ply_header(text):
         elif words[:1] == ["element"]:
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
-            types = [_PLY_TYPES.get(word) for word in words[1:-1] if word != "list"]
+            types = [PLY_TYPES.get(word) for word in words[1:-1] if word != "list"]
             if not elements or not all(types):
                 line = " ".join(words)[:80]
                 raise ValueError(
@@ -656,6 +654,8 @@ def _read_off(data):
     if min(n, m) < 0:
         raise ValueError(f"counts from 0 expected, found {n} vertices and {m} faces")
     _need(n + m, len(lines) - 1, "lines of vertices and faces")
+    if any(line.lstrip().startswith(b"OFF") for line in lines[n + m + 1 :]):
+        raise ValueError("one mesh expected, found a second OFF: write each to a file of its own")
     points = np.array([line.split()[:3] for line in lines[1 : n + 1]], np.float64)
     corners, sizes = [], []
     for line in lines[n + 1 : n + 1 + m]:
@@ -669,7 +669,9 @@ def _read_off(data):
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-_STL_FACETS = re.compile(rb"^[ \t]*(?:facet|endsolid)\b", re.I | re.M)  # names are free text
+# at the start of a line, as the name of a solid is free text
+_STL_FACETS = re.compile(rb"[\r\n][ \t]*(facet|endsolid)\b", re.I)
+_STL_VERTEX = re.compile(rb"[\r\n][ \t]*vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.I)
 
 
 def _is_binary_stl(data):
@@ -695,8 +697,7 @@ def _read_stl(data):
     count = int.from_bytes(data[80:84], "little")
     starts_as_ascii = re.match(rb"\s*solid\b", data, re.I) and b"\0" not in data[:1000]
     if starts_as_ascii and len(data) != 84 + 50 * count:
-        vertices = re.findall(rb"^[ \t]*vertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.I | re.M)
-        words = [word.split()[0].lower() for word in _STL_FACETS.findall(data)]
+        vertices, words = _STL_VERTEX.findall(data), _STL_FACETS.findall(data.lower())
         _need(3 * words.count(b"facet"), len(vertices), "vertices of facets")
         _need(1, words.count(b"endsolid"), "endsolid")
         corners = np.array(vertices, np.float64)
@@ -840,7 +841,8 @@ def _read_npz(data):
     keys = next((keys for keys in NPZ_KEYS if set(keys) <= set(arrays)), None)
     if keys is None:
         wanted = " or ".join(" and ".join(keys) for keys in NPZ_KEYS)
-        raise ValueError(f"the keys {wanted} expected, found {', '.join(arrays) or 'none'}")
+        found = ", ".join(arrays) or "nothing"
+        raise ValueError(f"the keys {wanted} expected, found a ZIP archive of {found}")
     points, triangles = (arrays[key]() for key in keys)
     if triangles.dtype.kind not in "iu":
         raise ValueError(f"integer indices expected in {keys[1]}, found {triangles.dtype}")

@@ -16,6 +16,7 @@ from scipy import sparse
 
 from s4a.geometry.mesh import directed_edges
 from s4a.input.coordinates import CoordinateSystem, nifti_system
+from s4a.input.formats import PLY_TYPES
 from s4a.input.raw import check_there, content, gunzip, reading
 from s4a.options import check_label
 
@@ -194,11 +195,25 @@ def _as_nifti(data):
             "a header with type, sizes and encoding, and voxels in the same file, expected; save "
             "it as one .nrrd file"
         )
-    values = _nrrd_values(fields, data[end.end() :])
+    kind = re.sub("^signed | int$|_t$", "", fields["type"]).replace("unsigned ", "u")
+    sizes = [int(word) for word in fields["sizes"].split()]
+    if kind not in PLY_TYPES or fields["encoding"] not in ("raw", "gzip", "gz") or len(sizes) != 3:
+        raise ValueError(
+            "numbers, the encoding raw or gzip, and three sizes expected, found "
+            f"{fields['type']}, {fields['encoding']} and {fields['sizes']}: "
+            "export a label map, without overlapping segments"
+        )
+    body = data[end.end() :]
+    body = body if fields["encoding"] == "raw" else gunzip(io.BytesIO(body), _UNPACKED)
+    dtype = np.dtype((">" if fields.get("endian") == "big" else "<") + PLY_TYPES[kind])
+    needed = math.prod(sizes) * dtype.itemsize
+    if min(sizes) < 1 or needed > len(body):
+        raise ValueError(f"{needed} bytes of voxels {sizes} expected, found {len(body)}")
+    values = np.frombuffer(body, dtype, math.prod(sizes)).reshape(sizes, order="F")
     image = nibabel.Nifti1Image(values, None, dtype=values.dtype)
     image.header.set_xyzt_units("mm")
-    axes = re.findall(r"\(([^()]*)\)", fields.get("space directions", ""))
-    axes = np.array([axis.split(",") for axis in axes], float)
+    found = re.findall(r"\(([^()]*)\)", fields.get("space directions", ""))
+    axes = np.array([axis.split(",") for axis in found], float)
     signs = _SPACES.get(fields.get("space", "").lower())
     if signs and axes.shape == (3, 3):
         origin = fields.get("space origin", "(0,0,0)").strip("()").split(",")
@@ -209,32 +224,6 @@ def _as_nifti(data):
         spacings = np.array(fields.get("spacings", "1 1 1").split(), float)
         image.header.set_zooms(np.linalg.norm(axes, axis=1) if len(axes) else spacings)
     return image.to_bytes()
-
-
-def _nrrd_values(fields, body):
-    """Voxels (x, y, z) of an NRRD file."""
-    names = {"char": 1, "int8": 1, "short": 2, "int16": 2, "int": 4, "int32": 4, "long long": 8,
-             "longlong": 8, "int64": 8}  # fmt: skip
-    found = re.fullmatch(r"(u|unsigned )?(?:signed )?(\w+?|long long)(?: int|_t)?", fields["type"])
-    floats = {"float": "f4", "double": "f8"}
-    if not found or found[2] not in names | floats:
-        raise ValueError(f"numbers expected, found the type {fields['type']}")
-    code = floats.get(found[2]) or f"{'u' if found[1] else 'i'}{names[found[2]]}"
-    if fields["encoding"] in ("gzip", "gz"):
-        body = gunzip(io.BytesIO(body), _UNPACKED)
-    elif fields["encoding"] != "raw":
-        raise ValueError(f"the encoding raw or gzip expected, found {fields['encoding']}")
-    sizes = [int(word) for word in fields["sizes"].split()]
-    if len(sizes) != 3:
-        raise ValueError(
-            f"three sizes expected, found {sizes}: segments may overlap; export them in 3D Slicer "
-            "as a label map"
-        )
-    dtype = np.dtype((">" if fields.get("endian") == "big" else "<") + code)
-    needed = math.prod(sizes) * dtype.itemsize
-    if min(sizes) < 1 or needed > len(body):
-        raise ValueError(f"{needed} bytes of voxels {sizes} expected, found {len(body)}")
-    return np.frombuffer(body, dtype, math.prod(sizes)).reshape(sizes, order="F")
 
 
 def _shape_of(header):

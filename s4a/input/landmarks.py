@@ -11,7 +11,7 @@ import xarray as xr
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, edge_graph, edges, triangle_areas
 from s4a.input.annotations import read_landmarks
-from s4a.input.coordinates import CoordinateSystem, file_system, moved, transform
+from s4a.input.coordinates import CoordinateSystem, file_system, moved, transform, with_system
 from s4a.input.raw import shown
 from s4a.schema import check_type, dataset, require
 
@@ -80,18 +80,12 @@ def locate(
     maps = possible_maps(CoordinateSystem.of(landmarks.attrs), mesh)
     found = {name: _project(moved(P, M), X, T) for name, M in maps.items()}
     far = {name: projected[2].max() for name, projected in found.items()}
-    best = given = next(iter(found))
-    if far[given] > limit / 3:
-        best = min(far, key=lambda name: (far[name] > far[given] / 2, far[name]))
+    given = next(iter(found))
+    better = [name for name in far if far[given] > limit / 3 and far[name] < far[given] / 2]
+    best = min(better, key=lambda name: far[name], default=given)
     surface_point, position, distance = found[best]
-    limit = limit if best in (KNOWN, GIVEN) else limit / 3  # a guess needs more evidence
-    if best not in (KNOWN, GIVEN):
-        log.warning(
-            "the coordinate system of the landmarks or of the mesh is unknown: %s fits, with at "
-            "most %.3g from the surface; coordinate_system= says it",
-            best,
-            distance.max(),
-        )
+    is_guess = best not in (KNOWN, GIVEN)
+    limit = limit / 3 if is_guess else limit  # a guess needs more evidence
     if distance.max() > limit:
         worst = int(distance.argmax())
         name = str(landmarks["landmark_name"].values[worst])
@@ -102,6 +96,13 @@ def locate(
             "or coordinate system (RAS, LPS)? Landmarks: "
             f"{CoordinateSystem.of(landmarks.attrs)}; mesh: {CoordinateSystem.of(mesh.attrs)}; "
             "coordinate_system= and unit= say what a file does not"
+        )
+    if is_guess:
+        log.warning(
+            "the coordinate system of the landmarks or of the mesh is unknown: %s fits, with at "
+            "most %.3g from the surface; coordinate_system= says it",
+            best,
+            distance.max(),
         )
     return _located(
         surface_point,
@@ -129,16 +130,15 @@ def possible_maps(landmarks: CoordinateSystem, mesh: xr.Dataset) -> dict[str, np
         found = {"a common origin": transform(L, S, origin=False)}
     else:
         found = {GIVEN: transform(CoordinateSystem(unit=L.unit), CoordinateSystem(unit=S.unit))}
-    guesses = {text: CoordinateSystem(text, "", unit) for text in ("RAS", "LPS")}
-    if S.axes and not L.axes:
-        guesses = {f"landmarks in {text}": (guess, S) for text, guess in guesses.items()}
-        guesses["the coordinates of the file"] = file_system(mesh.attrs), S
-    elif L.axes and not S.axes:
-        guesses = {f"a mesh in {text}": (L, guess) for text, guess in guesses.items()}
-    else:
-        guesses = {}
-    found |= {name: transform(*pair) for name, pair in guesses.items()}
-    return {name: M for name, M in found.items() if M is not None}
+    for text in ("RAS", "LPS"):
+        guess = CoordinateSystem(text, "", unit)
+        if S.axes and not L.axes:
+            found[f"landmarks in {text}"] = transform(guess, S)
+        elif L.axes and not S.axes:
+            found[f"a mesh in {text}"] = transform(L, guess)
+    if not L.axes:
+        found["the coordinates of the file"] = transform(file_system(mesh.attrs), S)
+    return {name: M for name, M in found.items() if M is not None} or {GIVEN: np.eye(4)}
 
 
 def _project(P, X, T):
@@ -234,7 +234,13 @@ def trace_curves(landmarks: xr.Dataset, mesh: xr.Dataset) -> xr.Dataset:
     )
 
 
-def with_landmarks(mesh: xr.Dataset, landmarks: xr.Dataset | Path | str) -> xr.Dataset:
+def with_landmarks(
+    mesh: xr.Dataset,
+    landmarks: xr.Dataset | Path | str,
+    *,
+    coordinate_system: str | None = None,
+    unit: str | None = None,
+) -> xr.Dataset:
     """Add landmarks that guide the registration of a mesh.
 
     Landmarks of two shapes are paired by name.  They guide the rigid alignment, the initial map for
@@ -247,6 +253,8 @@ def with_landmarks(mesh: xr.Dataset, landmarks: xr.Dataset | Path | str) -> xr.D
         Clean mesh, see :func:`s4a.read_shape` and :func:`s4a.clean`.
     landmarks : Dataset or path
         A landmark file, or what :func:`s4a.input.annotations.read_landmarks` returns.
+    coordinate_system, unit : str, optional
+        Used if the landmarks do not say theirs (:mod:`s4a.input.coordinates`).
 
     Returns
     -------
@@ -275,7 +283,7 @@ def with_landmarks(mesh: xr.Dataset, landmarks: xr.Dataset | Path | str) -> xr.D
     >>> s4a.with_landmarks(mesh, top)["guide_name"].values.tolist()
     ['top']
     """
-    points = as_landmarks(landmarks)
+    points = with_system(as_landmarks(landmarks), coordinate_system, unit)
     what = "landmarks" if isinstance(landmarks, xr.Dataset) else shown(landmarks)
     if "landmark_curve" in points:
         points = points.isel(landmark=points["landmark_curve"].values == "")

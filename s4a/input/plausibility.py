@@ -407,6 +407,13 @@ KINDS = {
     "registration": (True, "registration {sure} (score {registration_error:.3f}{distortion}): "
         "inspect it with s4a view, compare its file with the template's, or remove it",
         "look at the page; a larger --n-coarse may help"),
+    "influential": (False, "makes mode {component} almost alone: {percent:.0f} % of its sum of "
+        "squared scores, and the mode has {mode_percent:.1f} % of the variance: check size and "
+        "registration of the shape, and compare with the modes without it",
+        "it makes a mode of variation almost alone: check it"),
+    "near-copy": (False, "nearly the same shape as {other}: their distance is {percent:.1f} % of "
+        "the usual distance between neighbours; keep one of them, if they are copies",
+        "keep one file of each shape"),
 }
 # fmt: on
 # kind: attribute of the comparison, and the least value that is reported

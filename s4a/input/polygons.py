@@ -9,8 +9,8 @@ import numpy as np
 Polygons = tuple[np.ndarray, np.ndarray]
 _FLAT = 1e-6  # largest distance of corners from the plane of a planar polygon, in its extents
 _NEGATIVE = 1e-7  # largest share of the area of a triangle that may be folded over, by rounding
-_STARTS = 8  # corners of a polygon that are tried as the common corner of its triangles
-_WORK = 2e8  # corners that are tested for a polygon by ear clipping, after which it is refused
+_EPSILON = 1e-12  # area of a triangle that is not distinguished from 0, for extents of 1
+_MOST = 20_000  # corners of a concave polygon, as ear clipping takes the square of their number
 
 
 def polygons(corners: np.ndarray, offsets: np.ndarray) -> Polygons:
@@ -50,25 +50,20 @@ def strips(corners: np.ndarray, sizes: np.ndarray) -> Polygons:
     # 1---3   0, 1, 2 and 3, 2, 1
     # | \ |
     # 0---2
-    first, step = _steps(sizes)
-    odd = step % 2
-    triangles = np.stack([first + step + 2 * odd, first + step + 1, first + step + 2 - 2 * odd], 1)
-    return corners[triangles].ravel(), np.full(len(triangles), 3)
-
-
-def _steps(sizes):
-    """First corner of the polygon of each triangle, and number of the triangle in its polygon."""
-    count = np.maximum(sizes - 2, 0)  # triangles of each polygon
+    count = np.maximum(sizes - 2, 0)  # triangles of each strip
     first = np.repeat(np.cumsum(sizes) - sizes, count)
-    return first, np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    first, odd = first + step, step % 2
+    triangles = np.stack([first + 2 * odd, first + 1, first + 2 - 2 * odd], axis=1)
+    return corners[triangles].ravel(), np.full(len(triangles), 3)
 
 
 def triangulated(X: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, int]:
     """Triangulate polygons; those of fewer than three corners give no triangle.
 
     A planar polygon is cut into triangles from its first corner, if none of them is folded over.
-    Otherwise the common corner is the first one, in the order of vertices, from which none is; if
-    there is none, ears are clipped.  Area and volume do not depend on the order of the corners.
+    Otherwise it is cut from its vertex of the lowest index, or, if a triangle is then folded over,
+    by ear clipping.  Area and volume do not depend on which corner is the first.
 
     Parameters
     ----------
@@ -81,12 +76,12 @@ def triangulated(X: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple
     -------
     T : int ndarray (m, 3)
     n_crossing : int
-        Number of polygons that intersect themselves; the triangles of these are as good as any.
+        Number of polygons that intersect themselves.
 
     Raises
     ------
     ValueError
-        If a polygon is too complex.
+        If a concave polygon has more than 20,000 corners.
 
     Examples
     --------
@@ -99,52 +94,41 @@ def triangulated(X: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple
     # 3---2   the first corner and each opposite side
     # | / |
     # 0---1
+    if (sizes == 3).all():
+        return corners.reshape(-1, 3), 0
     begin, count = np.cumsum(sizes) - sizes, np.maximum(sizes - 2, 0)
-    T, end, n_crossing = np.empty((count.sum(), 3), corners.dtype), np.cumsum(count), 0
-    reach = np.abs(X[np.isfinite(X)]).max(initial=0)
+    T, first, n_crossing = np.empty((count.sum(), 3), corners.dtype), np.cumsum(count) - count, 0
+    rounding = 2e-7 * np.abs(X[np.isfinite(X)]).max(initial=0)  # of single precision
     for size in np.unique(sizes[count > 0]).tolist():
         which, at = np.flatnonzero(sizes == size), np.arange(size)
         rows = corners[begin[which, None] + at]  # (q, size)
-        start, in_ears = _starts(X[rows], rows, reach)
-        rows = np.take_along_axis(rows, (start[:, None] + at) % size, axis=1)
+        folded, is_planar = _fans(X[rows], rounding)
+        again = np.flatnonzero(folded | ~is_planar)
+        lowest = rows[again].argmin(axis=1)[:, None]
+        rows[again] = np.take_along_axis(rows[again], (lowest + at) % size, axis=1)
+        folded[again], _ = _fans(X[rows[again]], rounding)
         common = np.broadcast_to(rows[:, :1], (len(rows), size - 2))
         cut = np.stack([common, rows[:, 1:-1], rows[:, 2:]], axis=2)
-        for i in np.flatnonzero(in_ears):
+        for i in np.flatnonzero(folded):
             ears, is_simple = _ears(X[rows[i]])
             cut[i], n_crossing = rows[i][ears], n_crossing + (not is_simple)
-        T[(end - count)[which, None] + at[: size - 2]] = cut
+        T[first[which, None] + at[: size - 2]] = cut
     return T, n_crossing
 
 
-def _starts(P, rows, reach):
-    """Corner from which each polygon is cut, and whether ears must be clipped instead.
+def _fans(P, rounding):
+    """Whether triangles from the first corner of polygons ``(q, c, 3)`` are folded over.
 
-    Parameters
-    ----------
-    P : ndarray (q, c, 3)
-        Polygons of c corners.
-    rows : int ndarray (q, c)
-        Their vertices.
-    reach : float
-        Largest coordinate of the file, which says how much coordinates are rounded.
+    Also whether the polygons are planar, up to the rounding of coordinates.
     """
-    P, at = P - P.mean(axis=1, keepdims=True), np.arange(rows.shape[1])
-    N = np.cross(P, np.roll(P, -1, axis=1)).sum(axis=1)  # (q, 3), of twice the area
+    P = P - P[:, :1]
+    parts = np.cross(P[:, 1:-1], P[:, 2:])
+    N = parts.sum(axis=1)  # (q, 3), as long as twice the area
     length = np.linalg.norm(N, axis=1)
+    folded = np.einsum("qti,qi->qt", parts, N) < -_NEGATIVE * length[:, None] ** 2
     height = np.abs(np.einsum("qci,qi->qc", P, N)).max(axis=1)
-    is_planar = ~(height > (_FLAT * np.abs(P).max(axis=(1, 2)) + 2e-7 * reach) * length)
-    order = np.argsort(rows, axis=1, kind="stable")
-    start, todo = order[:, 0].copy(), np.arange(len(rows))
-    for candidate in [np.where(is_planar, 0, start), *order[:, :_STARTS].T]:
-        turned = (candidate[todo, None] + at) % len(at)
-        Q = np.take_along_axis(P[todo], turned[..., None], axis=1)
-        Q = Q - Q[:, :1]
-        areas = np.einsum("qci,qi->qc", np.cross(Q[:, 1:-1], Q[:, 2:]), N[todo])
-        folded = (areas < -_NEGATIVE * length[todo, None] ** 2).any(axis=1)
-        start[todo[~folded]] = candidate[todo[~folded]]
-        todo = todo[folded]
-    start[todo] = order[todo, 0]
-    return start, np.isin(np.arange(len(rows)), todo)
+    is_planar = ~(height > (_FLAT * np.abs(P).max(axis=(1, 2)) + rounding) * length)
+    return folded.any(axis=1), is_planar
 
 
 def _ears(P):
@@ -152,31 +136,29 @@ def _ears(P):
 
     Ears without area are clipped last, so corners on a straight side belong to a triangle.
     """
+    if len(P) > _MOST:
+        raise ValueError(
+            f"concave polygons of at most {_MOST} corners expected, found {len(P)}: save the "
+            "surface as triangles"
+        )
     P = P - P.mean(axis=0)
     N = np.cross(P, np.roll(P, -1, axis=0)).sum(axis=0)
     k = int(np.abs(N).argmax())
     P = P[:, [(k + 1) % 3, (k + 2) % 3][:: 1 if N[k] > 0 else -1]]  # counter-clockwise
     P = P / (np.abs(P).max() or 1.0)
-    left, ears, at, n_failed, is_simple, steps = list(range(len(P))), [], 0, 0, True, 0
+    left, ears, at, n_failed = list(range(len(P))), [], 0, 0
     while len(left) > 2:
-        steps += 1
-        if steps * len(P) > _WORK:
-            raise ValueError(
-                f"a concave polygon of {len(P)} corners is too complex: "
-                "save the surface as triangles"
-            )
         n = len(left)
         corners = [left[(at + i) % n] for i in (-1, 0, 1)]
         turn = _turn(*P[corners])
-        is_ear = turn > 1e-12 and not _any_inside(P[corners], P[left])
-        if is_ear or (n_failed >= n and turn > -1e-12) or n_failed >= 2 * n:
-            is_simple &= turn > -1e-12
+        is_ear = turn > _EPSILON and not _any_inside(P[corners], P[left])
+        if is_ear or (n_failed >= n and turn > -_EPSILON) or n_failed >= 2 * n:
             ears.append(corners)
             left.pop(at % n)
             at, n_failed = at % n, 0
         else:
             at, n_failed = at + 1, n_failed + 1
-    return np.array(ears), is_simple
+    return np.array(ears), bool((_turn(*P[np.array(ears).T]) > -_EPSILON).all())
 
 
 def _turn(a, b, c):
@@ -189,6 +171,6 @@ def _any_inside(triangle, points):
     """Whether any of the points, other than the corners, is in a triangle or on its sides."""
     inside = np.ones(len(points), bool)
     for i in range(3):
-        inside &= _turn(triangle[i - 1], triangle[i], points) > -1e-12
+        inside &= _turn(triangle[i - 1], triangle[i], points) > -_EPSILON
         inside &= (points != triangle[i]).any(axis=1)
     return bool(inside.any())

@@ -458,6 +458,61 @@ def fmap_from_landmarks(
     return fit(F, G, penalty=penalty, constant=_constant_to_constant(source, target))
 
 
+def fmap_from_wave_kernels(
+    source: Basis,
+    target: Basis,
+    landmark_source: Array,
+    landmark_target: Array,
+    *,
+    k: int = 20,
+    weights: tuple[float, float, float] = (1.0, 1e-2, 1e-1),
+) -> Array:
+    """Fit a functional map ``(k, k)`` to wave kernels as pyFM 1.3.1 does.
+
+    Descriptors are the wave kernel signature of each shape and those around the landmarks, of norm
+    1.  The energy has the terms of descriptors, of the Laplacians (by their resolvents, Ren et al.
+    2019), and of the multiplication operators.  Each term is divided by its mean for orthogonal
+    maps, see ``pyFM.optimize.weights.canonical_taus``.
+
+    Parameters
+    ----------
+    source, target : Basis
+        With all eigenfunctions.
+    landmark_source, landmark_target : int ndarray (p,)
+        Corresponding vertices.
+    weights : tuple of float
+        Weights of the three terms; only their ratios matter.
+    """
+    F, operators, spectra = [], [], []
+    n = min(source.k, target.k)
+    for shape, landmark in ((source, landmark_source), (target, landmark_target)):
+        kernel = wave_filter(shape.eigenvalue[:n])[::EVERY]
+        Phi = shape.Phi[:, :n]
+        f = np.column_stack([signature(Phi, kernel), landmark_signature(Phi, kernel, landmark)])
+        f /= np.sqrt(shape.area @ f**2)
+        F.append(Phi[:, :k].T @ (shape.area[:, None] * f))  # (k, d)
+        operators.append(multiplication(Phi[:, :k], shape.area, f))  # (d, k, k)
+        spectra.append(shape.eigenvalue[:k])
+    root = np.sqrt(np.abs(spectra) / np.max(spectra))
+    resolvent = (root - 1j) / (root**2 + 1)  # of both, (2, k)
+    mask = np.abs(resolvent[0] - resolvent[1][:, None]) ** 2  # (k_target, k_source)
+    gram = [values[1:].T @ values[1:] for values in F]
+    n_independent = np.mean([np.trace(G) ** 2 / (G**2).sum() for G in gram])
+    traces = [np.trace(P, axis1=1, axis2=2) for P in operators]
+    squares = sum((P**2).sum() for P in operators)
+    scales = (
+        (F[0][1:] ** 2).sum() / n_independent,  # without the constant
+        mask.mean() * k,
+        (squares - 2 * (traces[0] @ traces[1]) / k) / n_independent,
+    )
+    w_descriptor, w_laplacian, w_operator = np.divide(weights, scales)
+    root_w = np.sqrt(w_descriptor)
+    constant = _constant_to_constant(source, target)
+    operator = [(w_operator, *operators)]
+    penalty = w_laplacian * mask
+    return fit(root_w * F[0], root_w * F[1], penalty=penalty, operators=operator, constant=constant)
+
+
 def landmark_descriptors(
     source: Basis, target: Basis, landmark_source: Array, landmark_target: Array
 ) -> tuple[Array, Array]:

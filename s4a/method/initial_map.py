@@ -92,6 +92,9 @@ def fit_after_alignment(
         C = fmap.fmap_from_match(M.Phi, N.Phi, N.mass, near)
         return _InitialMap(init, C, C, near)
     landmarks = landmarks_after_alignment(M.X, N.X, transform)
+    if init == "wave_kernels":
+        C = fmap.fmap_from_wave_kernels(source, target, *landmarks, k=k_init)
+        return _InitialMap(init, C, C, near, landmarks)
     C = fmap.fmap_from_landmarks(M, N, *landmarks)
     F, G = fmap.landmark_descriptors(M, N, *landmarks)
     energies = fmap.landmark_energies(M, N, C, F, G)
@@ -116,8 +119,9 @@ def map_after_alignment(
         At low resolution.
     transform : tuple (R, t)
         Rigid transform of the source onto the target (step 2).
-    init : {"dense", "landmarks"}
-        Fit to nearest neighbours of all vertices, or as in the paper to 10 farthest points.
+    init : {"dense", "landmarks", "wave_kernels"}
+        Fit to nearest neighbours of all vertices, as in the paper to 10 farthest points, or to wave
+        kernels of the shapes and around these points.
     initial_refinement : bool
         Whether to refine the map by a step of ZoomOut (4.2).
     n_samples : int

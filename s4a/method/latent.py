@@ -33,6 +33,7 @@ from s4a.method.network import (
     cycle_errors,
     cycle_weights,
     in_threads,
+    program_errors,
     spectral_distance,
     three_cycles,
 )
@@ -331,10 +332,11 @@ def consistent_zoomout(
         Growth per iteration.
     n_latent : int, optional
         Final latent dimension; k by default.
-    weights : {"cycles", "equal"}
-        Weights of the maps: by cycle error, or 1 for all.
+    weights : {"cycles", "linear_program", "equal"}
+        Weights of the maps: by cycle error, by the errors of
+        :func:`s4a.method.network.program_errors`, or 1 for all.
     isometric : bool
-        Whether each iteration starts with :func:`isometric_maps`.
+        Whether :func:`isometric_maps` come before each latent basis, also the last.
     samples : list of int ndarray, optional
         Farthest-point samples of every shape, at least 2 k unless they are all vertices; all
         vertices by default.
@@ -377,9 +379,10 @@ def consistent_zoomout(
     for size, next_size in zip(
         sizes, [*sizes[1:], None], strict=True
     ):  # the last only solves for Y
-        C = isometric_maps(C, source, target) if isometric and next_size else C
-        error = cycle_errors(C, cycles, n_jobs=n_jobs)
-        weight = cycle_weights(error) if weights == "cycles" else np.ones(len(C))
+        C = isometric_maps(C, source, target) if isometric else C
+        by_program = weights == "linear_program"
+        error = program_errors(C, cycles) if by_program else cycle_errors(C, cycles, n_jobs=n_jobs)
+        weight = np.ones(len(C)) if weights == "equal" else cycle_weights(error)
         m = latent_size(n_latent, size, k)
         tolerance = ROUGH if next_size else FINE
         Y, latent_eigenvalue = latent_basis(

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from joblib import effective_n_jobs
+from scipy.optimize import linprog
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra, shortest_path
 
@@ -180,6 +181,44 @@ def cycle_errors(C: Array, cycles: Array, k: int | None = None, *, n_jobs: int |
     total = np.bincount(cycles.ravel(), np.repeat(error, 3), len(C))
     count = np.bincount(cycles.ravel(), minlength=len(C))
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def program_errors(C: Array, cycles: Array) -> Array:
+    """Return the errors of the maps ``(p,)`` by the linear program of Huang et al. (2020).
+
+    The least weighted sum of errors such that those of the three maps of a cycle sum to at least
+    |C_ki C_jk C_ij - I|_F, of the three starting points the largest.  The weight of a map is one
+    over the sum of these deviations over its cycles.  pyFM has the same program (``"icsm"``).
+
+    Parameters
+    ----------
+    C, cycles : see :func:`cycle_errors`
+
+    Returns
+    -------
+    float ndarray (p,)
+        NaN for maps in no 3-cycle.
+
+    References
+    ----------
+    R. Huang et al. (2020), Consistent ZoomOut: efficient spectral map synchronization, Computer
+    Graphics Forum 39(5).
+    """
+    deviation, identity = np.empty(len(cycles)), np.eye(C.shape[1])
+    for part in np.array_split(np.arange(len(cycles)), len(cycles) // 32 + 1):
+        products = [
+            C[c] @ C[b] @ C[a] for a, b, c in (np.roll(cycles[part].T, i, axis=0) for i in range(3))
+        ]
+        deviation[part] = np.linalg.norm(np.array(products) - identity, axis=(2, 3)).max(0)
+    rows = np.repeat(np.arange(len(cycles)), 3)
+    A = csr_array((np.ones(cycles.size), (rows, cycles.ravel())), shape=(len(cycles), len(C)))
+    total = A.T @ deviation  # (p,)
+    error = np.full(len(C), np.nan)
+    if len(cycles):
+        cost = 1 / np.maximum(total, np.finfo(float).tiny ** 0.5)
+        found = linprog(cost * (total > 0), A_ub=-A, b_ub=-deviation, method="highs-ds")
+        error = np.where(np.bincount(cycles.ravel(), minlength=len(C)) > 0, found.x, np.nan)
+    return error
 
 
 def cycle_weights(error: Array) -> Array:

@@ -198,6 +198,7 @@ def low_resolution(
     n_coarse: int = 6000,
     k: int = 100,
     refined_eigenfunctions: bool = False,
+    sampling: str = "normals",
     wrap: bool = False,
     seed: int = 0,
 ) -> xr.Dataset:
@@ -212,7 +213,7 @@ def low_resolution(
     if method == "scalable":
         low = reduced(mesh, n_coarse=n_coarse, k=k, seed=seed)
     else:
-        coarse = coarsen(mesh, n_coarse=n_coarse, wrap=wrap, seed=seed)
+        coarse = coarsen(mesh, n_coarse=n_coarse, sampling=sampling, wrap=wrap, seed=seed)
         low = spectrum(coarse, k=k + SPARE) if refined_eigenfunctions else spectrum(coarse, k=k)
         low = with_refined_eigenfunctions(mesh, low, k) if refined_eigenfunctions else low
     shape, landmarks, fields = Shape(mesh, low), vertices_of_landmarks(mesh), features_of(mesh)

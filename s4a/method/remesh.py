@@ -27,10 +27,11 @@ from scipy.spatial import cKDTree
 from s4a.geometry import mesh as surface
 from s4a.geometry import voronoi
 from s4a.geometry.align import many_farthest_points
-from s4a.geometry.closest import closest_point_in_star
+from s4a.geometry.closest import closest_point, closest_point_in_star
 from s4a.geometry.compiled import robust_laplacian
 from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas, vertex_normals
 from s4a.input.collection import Mesh, as_mesh
+from s4a.options import check
 from s4a.schema import Array, check_count, dataset
 from s4a.seeds import RNG, seed_of
 
@@ -85,6 +86,28 @@ def sample_surface(
     return np.sort(np.r_[sample, others])
 
 
+def sample_along_surface(X: Array, G: sp.csr_matrix, avoid: Array, k: int, seed: int = 0) -> Array:
+    """Sample k vertices as ReMatching does: farthest points along the edges, one at a time.
+
+    Parameters
+    ----------
+    X, G, avoid, k, seed : see :func:`sample_surface`
+
+    Returns
+    -------
+    int ndarray (k,), sorted
+    """
+    free = np.flatnonzero(~avoid)
+    start = free[many_farthest_points(X[free], 1, center=X.mean(0), seed=seed)]
+    samples, distance = start.tolist(), dijkstra(G, indices=start[0])
+    while len(samples) < k:
+        # a component without a sample comes first
+        samples.append(int(np.argmax(np.where(avoid, -1, distance))))
+        limit = distance[samples[-1]]
+        distance = np.minimum(distance, dijkstra(G, indices=samples[-1], limit=limit))
+    return np.sort(samples)
+
+
 def laplacian(X: Array, T: Array, area: Array) -> tuple[Array, Array, Array, str]:
     """Return edges, cotan weights, vertex areas and kind of the Laplacian.
 
@@ -123,7 +146,7 @@ def _sorted_mesh(X, T):
     return X[order], T[surface.lexical_order(np.stack([T[:, 2], first_two], axis=1))], order
 
 
-def _coarse_surface(X, T, n_coarse, seed=0):
+def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
     """Manifold dual of about `n_coarse` geodesic Voronoi cells.
 
     Returns
@@ -142,7 +165,11 @@ def _coarse_surface(X, T, n_coarse, seed=0):
         graph = voronoi.mesh_graph(V, F)
         is_centre = origin < 0
         n_initial = max(4, round(INITIAL_SHARE * n_coarse))
-        initial = sample_surface(V, F, graph.G, graph.E[graph.is_open], is_centre, n_initial, seed)
+        if sampling == "geodesic":
+            initial = sample_along_surface(V, graph.G, is_centre, n_initial, seed)
+        else:
+            boundary = graph.E[graph.is_open]
+            initial = sample_surface(V, F, graph.G, boundary, is_centre, n_initial, seed)
         cells = voronoi.voronoi_cells(graph.G, initial)
         state, iterations, faulty = voronoi.refine(graph, cells, max_samples, is_centre)
         if not faulty:
@@ -266,6 +293,7 @@ def coarsen(
     mesh: Mesh,
     *,
     n_coarse: int = 6000,
+    sampling: str = "normals",
     wrap: bool = False,
     seed: int = 0,
     rng: RNG | None = None,
@@ -282,6 +310,9 @@ def coarsen(
         as the rest is for samples that the topology needs.  A mesh with hundreds of handles may
         need more if n_coarse is in the hundreds.  A mesh that has no more
         vertices than n_coarse is returned unchanged.
+    sampling : {"normals", "geodesic"}
+        Sample farthest points in position and normal, or along the surface as in ReMatching.  Then
+        U is also that of ReMatching, from the closest point of the whole coarse mesh.
     wrap : bool
         Remesh an alpha wrap of the mesh.  This is meant for scans whose interior is irrelevant, and
         needs the extra ``s4a[wrap]``.
@@ -359,6 +390,7 @@ def coarsen(
     seed = seed_of(seed, rng)
     mesh = as_mesh(mesh)
     check_count("n_coarse", n_coarse, 4)
+    check("sampling", sampling)
     before = check_clean(*as_arrays(mesh))
     attrs: dict[str, int | str] = {
         "n_coarse": int(n_coarse),
@@ -375,12 +407,14 @@ def coarsen(
             kept_whole=1, samples_first=len(V), samples_added=0, iterations=0, vertices_cut=0
         )
     else:
-        Y, C, sample, cell, counts = _coarse_surface(V, F, n_coarse, seed)
+        Y, C, sample, cell, counts = _coarse_surface(V, F, n_coarse, seed, sampling)
         attrs |= counts
     if wrap:
         sample = np.full(len(Y), -1)
         cell = cell[_nearest_with_normal(X, T, V, F)]
-    triangle, weight = closest_point_in_star(X, cell, Y, C)  # (n,), (n, 3)
+    triangle, weight = (  # (n,), (n, 3)
+        closest_point(X, Y, C) if sampling == "geodesic" else closest_point_in_star(X, cell, Y, C)
+    )
     corner = C[triangle]  # (n, 3)
     if wrap:
         area = vertex_areas(Y, C)

@@ -176,11 +176,12 @@ def map_pairs(
     names = ("source", "target", "fmap_initial", "fmap_fitted", "pair_rotation", "pair_translation")
     *columns, marks = map(np.array, zip(*rows, strict=True))
     maps = dataset(None, **dict(zip((*names, "pair_residual"), columns, strict=True)))
-    if init != "landmarks":
+    if init == "dense":
         return maps
     # marks (p, 2, landmarks)
     marked = dataset(landmark_of_source=marks[:, 0], landmark_of_target=marks[:, 1])
-    return maps.merge(marked).merge(xr.concat(fits, dim="pair"))
+    fitted = xr.concat(fits, dim="pair") if init == "landmarks" else xr.Dataset()
+    return maps.merge(marked).merge(fitted)
 
 
 def build_network(
@@ -203,8 +204,9 @@ def build_network(
         Number of pairs in the network; all pairs if there are fewer.
     k_init : int
         Size of the initial functional maps.
-    init : {"dense", "landmarks"}
-        Fit initial maps to all nearest neighbours, or to 10 landmarks as in the paper.
+    init : {"dense", "landmarks", "wave_kernels"}
+        Fit initial maps to all nearest neighbours, to 10 landmarks as in the paper, or to wave
+        kernels of the shapes and around these landmarks as in pyFM.
     initial_refinement : bool
         Refine the initial maps by one ZoomOut iteration (4.2).
     n_samples : int

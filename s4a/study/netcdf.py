@@ -202,6 +202,10 @@ class Stored(BackendArray):
 
     def part(self, key: Any) -> np.ndarray:
         """Read the selection from the file; ValueError if the file was written again."""
+        if not self.file.exists():
+            raise FileNotFoundError(
+                f"{self.file} was removed since it was opened: put it back and open the study again"
+            )
         with damage_named(self.file), open_hdf5(self.file) as file:
             same = os.stat(self.file).st_mtime_ns == self.written
             # a repeated run may write the same contents

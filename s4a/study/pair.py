@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from s4a.input.collection import Mesh, as_mesh
+from s4a.input.collection import Mesh, as_meshes
 from s4a.method import fmap
 from s4a.method.alignment import align_onto, alignment_residual, less_confident
 from s4a.method.initial_map import initial_map
@@ -21,7 +21,12 @@ log = logging.getLogger(__name__)
 
 
 def match_pair(
-    source: Mesh, target: Mesh, *, preset: str | None = None, **options: Any
+    source: Mesh,
+    target: Mesh,
+    *,
+    preset: str | None = None,
+    keep_iterations: bool = False,
+    **options: Any,
 ) -> xr.Dataset:
     """Match two shapes at full resolution (4.1).
 
@@ -36,11 +41,13 @@ def match_pair(
     preset : {None, "paper", "fast"}
         ``"paper"`` uses the method of 4.1 without additions; ``"fast"`` sets n_coarse=3000.  None
         uses the defaults of S4A.
+    keep_iterations : bool
+        Whether to return map and match of every iteration of ZoomOut, and the descriptors of the
+        initial map.
     **options
         ``n_coarse, k_init, k, step, init, initial_refinement, full_resolution_iterations, refine,
-        articulated, refined_eigenfunctions, alignment, area_weighted, n_projected, method,
-        keep_iterations, seed`` or ``rng``.  :class:`s4a.Options` describes them and has their
-        defaults.
+        articulated, refined_eigenfunctions, alignment, sampling, area_weighted, n_projected,
+        method, seed`` or ``rng``.  :class:`s4a.Options` describes them and has their defaults.
 
     Returns
     -------
@@ -108,9 +115,10 @@ def match_pair(
     <TiledFigure ...>
     """
     settings = given_options({"preset": preset, **options}, pair=True)
-    meshes = as_mesh(source, "source"), as_mesh(target, "target")
+    settings = settings.changed({"keep_iterations": keep_iterations})
+    meshes = as_meshes({"source": source, "target": target}, settings)
     with threadpool_limits(1):  # matrices are small: more BLAS threads take longer
-        M, N = (shape_of(mesh, settings) for mesh in meshes)
+        M, N = (shape_of(mesh, settings) for mesh in meshes.values())
         registration, maps = match_shapes(M, N, settings)
     least = min(M.low.k, N.low.k)
     if least < settings.k:

@@ -16,7 +16,6 @@ from joblib import effective_n_jobs, parallel_config
 
 from s4a.input.chirality import AUTO, mean_chirality, mirrored_shapes, to_reflect
 from s4a.input.collection import remarks_on_files
-from s4a.input.coordinates import CoordinateSystem
 from s4a.input.plausibility import Flags
 from s4a.input.subjects import read_table
 from s4a.method.alignment import N_VOTERS
@@ -28,6 +27,7 @@ from s4a.schema import POSE, dataset
 from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
 from s4a.study.processes import limited, temporary_folder
 from s4a.study.quality_control import (
+    check_modes,
     check_plausibility,
     check_registrations,
     check_usable,
@@ -192,28 +192,24 @@ def analyse(
     if subjects is not None:
         check_one_structure(subjects)
     system, on_systems = common_system(sources, settings)
-    remarks += on_systems
     settings.check_against(list(sources))
     marked = find_guides(sources, settings.landmarks, settings.feature_names)
     with lock(store) as claim:
-        run = Run(claim, limited(limited(n_jobs), len(sources)))
+        n = len(sources)
+        n_tasks = max(n, n * (n - 1) // 8)  # of shapes, or of four pairs each
+        run = Run(claim, limited(limited(n_jobs), n_tasks), system)
         if subjects is not None:
             write(with_contents(subjects, sources), run.folder / "subjects.nc", name="subjects")
         else:
             remarks = remarks + remarks_on_table(run.folder / "subjects.nc", sources)
         remarks = remarks + remarks_on_guides(sources, marked, settings.feature_names)
         with run.report_unforeseen():
-            run_steps(run, sources, marked, settings, remarks, system)
+            run_steps(run, sources, marked, settings, [*on_systems, *remarks])
     return open_study(store)
 
 
 def run_steps(
-    run: Run,
-    sources: Sources,
-    marked: Marked,
-    options: Options,
-    remarks: list[str],
-    system: CoordinateSystem | None,
+    run: Run, sources: Sources, marked: Marked, options: Options, remarks: list[str]
 ) -> None:
     """Run all steps of the paper; each skips files that are done."""
     # dependencies of the files; a key contains those of all files before it:
@@ -223,8 +219,8 @@ def run_steps(
     #   network/descriptor_*, comparison_*    latent/* of excluded -> registration/* <- registration
     #                                                     |
     #                                                pca, report
-    reflected, on_chirality = choose_reflected(run, sources, marked, options, system)
-    original = read_and_clean(run, sources, marked, options, reflected, system)
+    reflected, on_chirality = choose_reflected(run, sources, marked, options)
+    original = read_and_clean(run, sources, marked, options, reflected)
     original, flags, on_shapes = check_plausibility(run, original, options)
     stop_if_flagged(flags, options)
     coarse = remesh(run, original, options)
@@ -241,29 +237,20 @@ def run_steps(
     failed, on_registrations = check_registrations(run, registered, inserted)
     flags = {name: [*flags.get(name, []), *failed.get(name, [])] for name in registered}
     flags = unflagged(flags) if options.quality_control == "off" else flags
-    why_no_modes = modes(run, registered, flags, options, bool(on_poses))
+    why_no_modes, flags = modes(run, registered, flags, options, bool(on_poses))
     remarks = [*on_chirality, *on_exclusion, *on_poses, *on_shapes, *on_registrations, *remarks]
     write_report(run, sources, options, remarks, why_no_modes, registered, flags, bool(on_poses))
 
 
 def read_and_clean(
-    run: Run,
-    sources: Sources,
-    marked: Marked,
-    options: Options,
-    reflected: list[str],
-    system: CoordinateSystem | None,
+    run: Run, sources: Sources, marked: Marked, options: Options, reflected: list[str]
 ) -> Keys:
-    """Read and clean the shapes, add landmarks and fields, mirror some (5.1): ``/original``.
-
-    If there is a `system`, axes and unit of all shapes are converted to it.
-    """
+    """Read and clean the shapes, add landmarks and fields, mirror some (5.1): ``/original``."""
     cleaning = options.of("cleaning")
     todo = []
     for n, (source, content) in sources.items():
         also: dict[str, Any] = {"reflected": True} if n in reflected else {}
-        if system is not None:
-            also["system"] = system.attrs
+        also |= {"system": run.system} if run.system else {}
         key = (content, cleaning, *also.values())
         if n in marked:
             also["guides"] = landmarks, features = marked[n]
@@ -276,11 +263,7 @@ def read_and_clean(
 
 
 def choose_reflected(
-    run: Run,
-    sources: Sources,
-    marked: Marked,
-    options: Options,
-    system: CoordinateSystem | None,
+    run: Run, sources: Sources, marked: Marked, options: Options
 ) -> tuple[list[str], list[str]]:
     """Choose the shapes to mirror; return their names, and remarks.
 
@@ -297,10 +280,9 @@ def choose_reflected(
         return reflected, ["reflect= mirrors all shapes, with no effect"] if is_all else []
     file = run.folder / CHOICE
     contents = [content for _, content in sources.values()]
-    key = task_key(list(sources), contents, options.of("cleaning"), options.k, AUTO)
-    key = key if system is None else task_key(key, system.attrs)
+    key = task_key(list(sources), contents, options.of("cleaning"), run.system, options.k, AUTO)
     if not is_done(file, key):
-        original = read_and_clean(run, sources, marked, options, [], system)
+        original = read_and_clean(run, sources, marked, options, [])
         comparisons = comparisons_of(run, original, options) if len(original) > 1 else {}
         reflected, remarks = mirrored_shapes(comparisons)
         choice = dataset(
@@ -323,6 +305,8 @@ def remesh(run: Run, original: Keys, options: Options) -> Keys:
         settings = (*settings, "refined eigenfunctions")
     if options.method != "rematch":
         settings = (*settings, options.method)
+    if options.sampling != "normals":
+        settings = (*settings, options.sampling)
     todo = [
         Task(
             n,
@@ -445,7 +429,14 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
         )
         for node in [*iterations, "network", "latent"]:
             made_from = names_and_keys("coarse", coarse)
-            write(tree[node].to_dataset(), run.folder / f"{node}.nc", key, made_from, name=node)
+            write(
+                tree[node].to_dataset(),
+                run.folder / f"{node}.nc",
+                key,
+                made_from,
+                run.claim,
+                name=node,
+            )
     return key
 
 
@@ -522,7 +513,11 @@ def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Optio
                 register_shape,
                 (run.folder, n, template, options),
                 (template_key, key, *of_latent.values()),
-                (f"registration={template_key}", *names_and_keys("latent", of_latent)),
+                (
+                    f"registration={template_key}",
+                    *names_and_keys("coarse", {n: key}),
+                    *names_and_keys("latent", of_latent),
+                ),
             )
         )
     registered = run.do("registration", todo)
@@ -532,11 +527,18 @@ def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Optio
 
 def modes(
     run: Run, registered: Keys, flags: Flags, options: Options, ambiguous: bool = False
-) -> str:
-    """Compute the modes of variation (6.1), ``/pca``; return the reason if there are none.
+) -> tuple[str, Flags]:
+    """Compute the modes of variation (6.1), ``/pca``.
 
     Flagged shapes are excluded; their scores are computed along the modes of the others.  With
     `ambiguous`, shapes whose pose alone is ambiguous are included.
+
+    Returns
+    -------
+    why_no_modes : str
+        The reason if there are none.
+    flags : dict of str to list of Flag
+        Flags of the registered shapes, with the warnings of :func:`check_modes`.
     """
     with run.stage("modes"):
         mesh = read(run.folder / "registration.nc")
@@ -557,7 +559,8 @@ def modes(
         except ValueError as error:
             log.warning("no modes: %s", error)
             (run.folder / "pca.nc").unlink(missing_ok=True)
-            return str(error)
+            return str(error), flags
         made_from = names_and_keys("registration", registered)
         write(result, run.folder / "pca.nc", task_key(keys), made_from, name="pca")
-    return ""
+        warned = check_modes(result, float(data["vertex_area"].sum()))
+    return "", {name: [*flags[name], *warned.get(name, [])] for name in flags}

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import xarray as xr
+from scipy import stats
+from scipy.spatial.distance import pdist, squareform
 
 from s4a.geometry.crossing import can_count
 from s4a.input.plausibility import (
@@ -33,6 +35,11 @@ FLAGGED = 0.06
 WRONG, UNSURE = 0.0065, 0.004
 # the same over the median of the collection, as coarse meshes raise the product for all shapes
 WRONG_RATIO, UNSURE_RATIO = 2.0, 1.5
+# modes of variation: least number of shapes; least share of a shape in the sum of squared scores,
+# its largest p value, least share of the variance
+FEW, SHARE, ALONE, LARGE = 6, 0.7, 0.001, 0.3
+# near copies: largest distance over the usual one and over sqrt(area), and largest p value
+NEAR, COPY, CHANCE = 0.2, 0.005, 0.02
 
 
 def check_plausibility(run: Run, original: Keys, options: Options) -> tuple[Keys, Flags, list[str]]:
@@ -242,6 +249,60 @@ def check_registrations(run: Run, registered: Keys, inserted: Keys) -> tuple[Fla
         name: float(np.abs(arrays(file, "distortion")[0]).mean()) for name, file in files.items()
     }
     return flagged(registration_error, distortion)
+
+
+def check_modes(pca: xr.Dataset, area: float) -> Flags:
+    """Warn about shapes that make a mode of variation alone, and about near copies.
+
+    Parameters
+    ----------
+    pca : Dataset
+        ``/pca``.
+    area : float
+        Area of the template.
+
+    Returns
+    -------
+    flags : dict of str to list of Flag
+        Warnings ``influential`` and ``near-copy``, which flag no shape.
+
+    Notes
+    -----
+    The scores of a mode of s normal shapes in random directions have Beta distributed shares of
+    their sum of squares, which give the p value of the largest share.  A near copy is much closer
+    to a shape than neighbours usually are; p is n x^m for a distance of x times the usual one in m
+    dimensions.  The number of dimensions is that of the modes (participation ratio), or that of the
+    distances to two neighbours (Facco et al. 2017), whichever is larger.
+
+    References
+    ----------
+    E. Facco et al. (2017), Estimating the intrinsic dimension of datasets by a minimal neighborhood
+    information, Scientific Reports 7.
+    """
+    flags: Flags = {}
+    names, n = pca["shape"].values.tolist(), pca.sizes["shape"]
+    score, ratio = pca["score"].values, pca["explained_variance_ratio"].values
+    if n < FEW:
+        return flags
+    share = score**2 / (score**2).sum(0)  # (n, c)
+    p = n * stats.beta.sf(share.max(0) * n / (n - 1), 0.5, (n - 2) / 2)
+    for c in np.flatnonzero((share.max(0) > SHARE) & (p < ALONE) & (ratio > LARGE)):
+        values = {"component": c + 1, "percent": 100 * share[:, c].max()}
+        one = flag("influential", **values, mode_percent=100 * ratio[c])
+        flags.setdefault(names[share[:, c].argmax()], []).append(one)
+    distance = squareform(pdist(score * pca["standard_deviation"].values))
+    np.fill_diagonal(distance, np.inf)
+    first, second = np.sort(distance, axis=1)[:, :2].T
+    usual = np.median(first)
+    dimension = np.log(2) / np.log(max(np.median(second / np.maximum(first, 1e-300)), 1.001))
+    dimension = min(max(dimension, 1 / (ratio**2).sum()), n)
+    for i, j in enumerate(distance.argmin(1)):
+        near = first[i] / usual
+        is_copy = near < NEAR and first[i] < COPY * np.sqrt(area) and n * near**dimension < CHANCE
+        if is_copy and not any(one.kind == "near-copy" for one in flags.get(names[j], [])):
+            one = flag("near-copy", other=names[j], percent=100 * near)
+            flags.setdefault(names[i], []).append(one)
+    return flags
 
 
 def flagged(

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -135,7 +135,8 @@ class Run:
         Seconds and MiB of every stage, in all runs over the folder.
     """
 
-    def __init__(self, claim: Claim, n_jobs: int | None):
+    def __init__(self, claim: Claim, n_jobs: int | None, system: Mapping[str, str] | None = None):
+        self.system = system  # attributes of the coordinate system to convert shapes to
         self.folder, self.n_jobs, self.claim = claim.folder, n_jobs, claim
         self.notes = Notes(self.folder, claim.owner)
         self.failures, self.costs = self.notes.failures, self.notes.costs

@@ -9,7 +9,7 @@ import xarray as xr
 
 from s4a.geometry.mesh import as_dataset
 from s4a.input.annotations import feature_files
-from s4a.input.coordinates import CoordinateSystem, common
+from s4a.input.coordinates import CoordinateSystem, common, says_nothing
 from s4a.input.files import check_names, files_named, find_meshes, systems_of
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.raw import read_bytes, shown
@@ -103,21 +103,21 @@ def _source_of(name, mesh):
     return mesh, content_key(mesh)
 
 
-def common_system(sources: Sources, options: Options) -> tuple[CoordinateSystem | None, list[str]]:
-    """Return the system to convert all shapes to, None if they have one, and a remark.
+def common_system(sources: Sources, options: Options) -> tuple[dict[str, str], list[str]]:
+    """Return attributes of the system to convert all shapes to, if they differ, and a remark.
 
     Raises ValueError if some systems are known and others are not.
     """
     given = CoordinateSystem.of(vars(options))
-    systems = systems_of({name: mesh for name, (mesh, _) in sources.items()}, given)
+    said = {n: m for n, (m, _) in sources.items() if isinstance(m, str) or not says_nothing(m)}
+    systems = systems_of(said, given)
     target = common(systems)
-    others = {n: s for n, s in systems.items() if (s.axes, s.unit) != (target.axes, target.unit)}
-    if not others:
-        return None, []
-    names = [f"{name} ({system})" for name, system in others.items()]
-    return target, [
-        f"{len(others)} of {len(systems)} shapes were converted to {target}: {listed(names)}"
+    others = [
+        f"{n} ({s})" for n, s in systems.items() if (s.axes, s.unit) != (target.axes, target.unit)
     ]
+    n_all = f"{len(others)} of {len(systems)} shapes"
+    remark = f"{n_all} were converted to {target}: {listed(others)}"
+    return (target.attrs, [remark]) if others else ({}, [])
 
 
 def content_of_file(path: Path | str) -> str:

@@ -46,11 +46,12 @@ def clean_shape(
     shape.  Raises OSError if a file has changed since its key was computed.
     """
     mesh = cleaned(source, content, cleaning)
+    system = {name: cleaning[name] for name in ("coordinate_system", "unit")}
     guides = also.get("guides", NO_GUIDES)
     if guides.landmarks is not None:
         file, key = guides.landmarks
         with unchanged(file, key):
-            mesh = with_landmarks(mesh, file)
+            mesh = with_landmarks(mesh, file, **system)
     fields = {}
     for name, (file, key) in guides.features.items():
         with unchanged(file, key):

@@ -409,6 +409,62 @@ def test_a_covariate_of_no_use_is_refused_with_what_to_do(covariate, words, twel
         statistics.group_test(*twelve, covariates={"it": covariate}, n_permutations=9)
 
 
+def test_a_code_of_a_missing_value_is_refused_in_whatever_form_the_values_come(twelve):
+    study, group = twelve
+    names = study["registration"]["shape"].values.tolist()
+    values = [31 + i * i % 7 if i != 3 else -999 for i in range(12)]
+    series = pandas.Series(values, names)
+    with_table = study.copy()
+    with_table["subjects"] = xr.Dataset({"age": ("shape", values)}, {"shape": names})
+    forms = [values, dict(zip(names, values, strict=True)), series, "age"]
+    forms += [pandas.DataFrame({"age": series}), xr.DataArray(values, {"shape": names})]
+    for given in forms:
+        with pytest.raises(ValueError, match="-999 of shape_03 is a code of a missing value"):
+            statistics.group_test(with_table, group, covariates={"it": given})
+        with pytest.raises(ValueError, match="-999 of shape_03 is a code of a missing value"):
+            statistics.regression(with_table, given)
+    group = [*group[:2], f"{group[2]}\u200b", *group[3:]]
+    for test in (statistics.group_test, statistics.group_map, statistics.classify):
+        with pytest.raises(ValueError, match=r"group: .*u200b.* \(shape_02\) look alike"):
+            test(study, group)
+
+
+def test_collinear_covariates_are_reported_and_a_variable_that_they_determine_is_refused(
+    twelve, caplog
+):
+    study, group = twelve
+    rng = np.random.default_rng(0)
+    age, noise = rng.uniform(20, 80, 12), rng.normal(size=12)
+    statistics.group_test(study, group, covariates={"age": age, "other": noise}, n_permutations=9)
+    assert "inflation" not in caplog.text
+    for size in (1e-4, 1, 20):
+        other = {"years": age, "months": 12 * age + size * noise}
+        statistics.group_test(study, group, covariates=other, n_permutations=9)
+        assert "'months' is nearly a linear combination of covariate 'years'" in caplog.text
+        caplog.clear()
+    with pytest.raises(ValueError, match="a combination of the covariates up to a variance inflat"):
+        statistics.regression(study, age, covariates=age + 1e-4 * noise, n_permutations=9)
+    statistics.regression(study, age, covariates=age + 2 * noise, n_permutations=9)
+    assert "the covariates explain most of the tested variable (variance inflation" in caplog.text
+    caplog.clear()
+    sites = np.repeat(list("abcd"), [1, 4, 4, 3])
+    statistics.group_test(study, group, covariates={"site": sites}, n_permutations=9)
+    assert "inflation" not in caplog.text
+
+
+def test_names_of_covariates_may_be_separated_by_commas(twelve):
+    study, group = twelve
+    names, rng = study["registration"]["shape"].values, np.random.default_rng(0)
+    columns = {name: ("shape", rng.normal(size=12)) for name in ("age", "size", "a,b")}
+    study = study.copy()
+    study["subjects"] = xr.Dataset(columns, {"shape": names})
+    for words in ("age,size", ["age, size"], ["age", "size,"], ["age", "size"]):
+        test = statistics.group_test(study, group, covariates=words, n_permutations=9)
+        assert test.attrs["covariates"] == "covariate 'age', covariate 'size'"
+    test = statistics.group_test(study, group, covariates="a,b", n_permutations=9)
+    assert test.attrs["covariates"] == "covariate 'a,b'"
+
+
 def test_the_handling_of_covariates_is_reported(twelve, caplog):
     study, group = twelve
     size = np.arange(12) ** 2

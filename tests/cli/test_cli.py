@@ -66,8 +66,8 @@ def test_a_script_can_ask_for_an_exit_code_where_shapes_are_not_ok(ran, folder, 
         assert cli.main([*command, "--fail-on", fail_on]) == code
     assert cli.main(["run", *command[1:2], *command[3:], "--fail-on", "flagged"]) == 0
     assert "1 excluded" in capsys.readouterr().out
-    report = dataset(status=["ok", "flagged"])
-    assert [exit_code(report, what, 1) for what in ("none", "excluded", "flagged")] == [1, 1, 3]
+    status = [dataset(status=["ok", "flagged"])["status"]]
+    assert [exit_code(status, what, 1) for what in ("none", "excluded", "flagged")] == [1, 1, 3]
 
 
 def test_run_writes_a_line_for_each_stage_where_there_is_no_terminal(ran):

@@ -95,6 +95,18 @@ def bomb(path):
     path.write_bytes(gzip.compress(bytes(2**26 + 2**20), 1))
 
 
+def utf_16(path):
+    path.write_text("".join("v {} {} {}\n".format(*x) for x in shape()[0]), encoding="utf-16")
+
+
+def two(path):
+    path.write_bytes(2 * WRITERS[".ply"](*shape(), {}))
+
+
+def other_kind(path):
+    path.write_bytes(b"\x89HDF\r\n\x1a\n" + np.arange(1000, dtype="<i4").tobytes())
+
+
 def points(path):
     path.write_text("OFF\n300 0 0\n" + "\n".join("{} {} {}".format(*x) for x in shape()[0]))
 
@@ -217,6 +229,14 @@ FAULTS = [
     Fault("compressed file that unpacks to too much", "bomb.ply.gz", bomb, "excluded",
           "at most 64 MiB expected in .* compressed bytes, found more",
           "excluded at 200 times its size (64 MiB at least, 1 GiB at most)", "unpack it yourself"),
+    Fault("text in UTF-16", "utf_16.obj", utf_16, "excluded",
+          "text in UTF-16 found: save it as UTF-8", "excluded", "save it as UTF-8"),
+    Fault("two PLY in one file", "two.ply", two, "excluded",
+          "one mesh expected, found a second PLY at byte", "excluded",
+          "write each mesh to a file of its own"),
+    Fault("a binary file of another kind", "other_kind.stl", other_kind, "excluded",
+          "expected, found an HDF5 file: export the surface", "excluded; never read as STL",
+          "export the surface as one of the formats"),
     Fault("points only", "points.off", points, "excluded", "no faces", "excluded",
           "export the surface, not the points"),
     Fault("quads and polygons", "quads.obj", quads, "ok", "^$", "triangulated", "nothing to do"),

@@ -229,8 +229,8 @@ def test_files_of_different_units_are_reported():
     meshes["shape_0"].attrs |= {"unit": "mm", "coordinate_system": "RAS"}
     meshes["shape_1"].attrs |= {"unit": "m", "coordinate_system": "LPS"}
     report = read_shapes(meshes)["report"].to_dataset()
-    assert "needed, found RAS, mm: shape_0; LPS, m: shape_1; unknown: " in report.attrs["remarks"]
     assert report["coordinate_system"].values[:3].tolist() == ["RAS, mm", "LPS, m", "unknown"]
+    assert report["reason"].values[1] == "converted from LPS, m to RAS, mm"
 
 
 def test_of_two_mirror_images_none_is_the_right_one():

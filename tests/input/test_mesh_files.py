@@ -334,10 +334,12 @@ def test_a_ply_says_what_its_header_lacks(tmp_path, before, after, words):
         read_mesh(tmp_path / "m.ply")
 
 
-def test_a_second_ply_in_a_file_is_named(tmp_path):
+def test_a_second_mesh_in_a_file_is_named(tmp_path):
     for order in ("ascii", "binary_little_endian"):
         with pytest.raises(ValueError, match=r"one mesh expected, found a second PLY at byte \d+"):
             read_mesh(file(tmp_path, "m.ply", 2 * ply(order)))
+    with pytest.raises(ValueError, match="one mesh expected, found a second OFF"):
+        read_mesh(file(tmp_path, "m.off", 2 * "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"))
 
 
 def test_text_in_utf_16_is_named(tmp_path):
@@ -358,6 +360,8 @@ def test_text_in_utf_16_is_named(tmp_path):
         (bytes(128) + b"DICM", "a DICOM file"),
         (b"\x89PNG\r\n\x1a\n", "a picture"),
         (b"BZh91AY", "a compressed file"),
+        (b"<!DOCTYPE html><html>", "a web page"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "a pointer of Git LFS"),
         (b"MZ\x08\0" + struct.pack("<III", 0, 100, 0), "found an overlay of values or colours"),
     ],
 )
@@ -365,6 +369,13 @@ def test_files_of_other_kinds_are_named(tmp_path, content, words):
     for body in (b"", bytes(400), np.arange(5000, dtype="<i4").tobytes()):
         with pytest.raises(ValueError, match=rf"m\.stl.*{words}"):
             read_mesh(file(tmp_path, "m.stl", content + body))
+
+
+def test_a_compressor_that_is_not_read_is_named_with_the_remedy(tmp_path):
+    _, _, given = SEEDS["VTP"]
+    content = next(c for c, finish in given if finish is fuzz.whole and b"ZLibDataComp" in c)
+    with pytest.raises(ValueError, match=r"found vtkLZ4DataCompressor: save it with .* ZLib"):
+        read_mesh(file(tmp_path, "m.vtp", content.replace(b"vtkZLib", b"vtkLZ4")))
 
 
 def test_no_other_binary_file_is_read_as_stl(tmp_path):
@@ -393,7 +404,7 @@ def test_the_name_of_an_stl_solid_is_free_text(tmp_path, name):
         + "  endloop\n endfacet\n"
         for t in T
     )
-    for end in ("\n", "\r\n"):
+    for end in ("\n", "\r\n", "\r"):
         text = f"solid {name}\n{facets}endsolid {name}\n".replace("\n", end)
         same_surface(file(tmp_path, "m.stl", text))
 

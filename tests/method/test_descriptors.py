@@ -6,6 +6,7 @@ Known answers, the optimum, and agreement with pyFM.
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from scipy.sparse import diags
 
 from s4a import coarsen, metrics, spectrum, synthetic
 from s4a.geometry.align import farthest_points
@@ -228,6 +229,26 @@ def test_the_fit_is_where_that_of_pyfm_ends(brains, oriented):
         constant=start,
     )
     assert ours == pytest.approx(peer.FM_12, abs=1e-4)
+
+
+def test_the_fit_to_wave_kernels_is_that_of_pyfm(brains):
+    functional, pyfm = map(pytest.importorskip, ("pyFM.functional", "pyFM.mesh"))
+    source, target = map(low, brains)
+    marks = farthest_points(source.X, 5)
+    near = np.linalg.norm(source.X[marks][:, None] - target.X, axis=2).argmin(1)
+    meshes = []
+    for basis in (source, target):
+        mesh = pyfm.TriMesh(basis.X, basis.T)
+        mesh.eigenvalues, mesh.eigenvectors = basis.eigenvalue, basis.Phi
+        mesh.A = diags(basis.area)
+        meshes.append(mesh)
+    peer = functional.FunctionalMapping(*meshes)
+    k = source.k
+    marked = np.stack([marks, near], axis=1)
+    peer.preprocess(n_descr=100, landmarks=marked, subsample_step=5, k_process=k, k_descr=k)
+    peer.fit(K=(8, 8), w_descr=1, w_lap=1e-2, w_dcomm=1e-1, factr=10, pgtol=1e-12)
+    found = fmap.fmap_from_wave_kernels(source, target, marks, near, k=8)
+    assert found == pytest.approx(peer.FM_12, abs=1e-4)
 
 
 def test_the_fit_on_descriptors_of_a_shape_and_itself_renumbered_is_the_map_between_them(brains):

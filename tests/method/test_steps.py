@@ -106,10 +106,10 @@ def test_words_that_options_cannot_be_are_refused_with_those_that_they_can(study
             s4a.register_shape(study, name, dense_match="our")
         with pytest.raises(TypeError, match="unexpected options projected; those of a registrat"):
             s4a.register_shape(study, name, projected=3)
-    with pytest.raises(ValueError, match="init must be one of 'dense', 'landmarks'; found"):
+    with pytest.raises(ValueError, match="init must be one of 'dense', 'landmarks'"):
         s4a.build_network(coarse, init="landmark")
     first = s4a.build_network(coarse, n_pairs=3, k_init=6)
-    with pytest.raises(ValueError, match="weights must be one of 'cycles', 'equal'; found"):
+    with pytest.raises(ValueError, match="weights must be one of 'cycles', 'linear_program'"):
         s4a.refine_network(coarse, first, k=10, weights="equl")
     with pytest.raises(ValueError, match="norm must be one of 'h2'"):
         s4a.refine_network(coarse, first, k=10, norm="h3")

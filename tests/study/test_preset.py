@@ -12,6 +12,8 @@ from small import FLAGS, OPTIONS
 import s4a
 from s4a.analysis import transfer
 from s4a.cli import main
+from s4a.geometry.closest import closest_point, interpolate
+from s4a.geometry.mesh import as_arrays
 from s4a.options import DECLARED, PRESETS, Options, with_options
 
 PAPER, FAST = PRESETS["paper"], PRESETS["fast"]
@@ -108,6 +110,26 @@ def test_pairs_of_the_paper_are_matched_in_one_direction_after_icp(three):
     assert np.array_equal(one["rotation"], one["icp_rotation"])
     fitted = s4a.match_pair(shape, template, refine="intrinsic", **PAIR)
     assert not np.allclose(fitted["rotation"], fitted["icp_rotation"])
+
+
+def test_the_readings_of_pyfm_and_rematching_are_options_on_top_of_the_preset(three):
+    readings = {"init": "wave_kernels", "isometric": True, "sampling": "geodesic"}
+    readings |= {"weights": "linear_program", "n_latent": 21}
+    study = s4a.analyse(three, **PAPER | readings, **OPTIONS)
+    network = study["network"].to_dataset()
+    C = network["fmap"].values
+    assert C[0] == pytest.approx(C[1].T)
+    assert study["latent"].sizes["latent"] == 21
+    assert (study["latent"]["distance_to_limit"] < 1e-3).all()
+    for name, coarse in study["coarse"].children.items():
+        (X, _), (Y, C) = as_arrays(study["original"][name]), as_arrays(coarse)
+        residual = X - s4a.projection_operator(coarse) @ Y
+        closest = interpolate(Y, C, *closest_point(X, Y, C))
+        assert np.linalg.norm(residual, axis=1) == pytest.approx(
+            np.linalg.norm(X - closest, axis=1), abs=1e-6
+        )
+    with pytest.raises(ValueError, match="has samples of its own"):
+        Options(method="scalable", sampling="geodesic")
 
 
 def test_lifted_functions_are_orthonormal_on_the_original_mesh_and_are_what_is_compared(three):

@@ -7,7 +7,9 @@ import xarray as xr
 from s4a import analyse, explore, insert, latent_match, open_study, statistics, synthetic
 from s4a.cli import tables
 from s4a.geometry.mesh import as_arrays
+from s4a.schema import dataset
 from s4a.show.page import study_html
+from s4a.study.quality_control import check_modes
 from s4a.study.tree import excluded_of, left_out
 
 OPTIONS = {"n_coarse": 200, "k_init": 8, "k": 20, "n_jobs": 1, "intersections": False}
@@ -213,3 +215,47 @@ def test_a_summary_of_many_flags_and_long_names_fits_on_a_screen(study):
         assert text.count("s4a run 'my scans'") == shown
         assert ("the same command with --include-flagged" in text) != shown
     assert {*names, *reason.split()} <= set(tables.report_table(many).split())
+
+
+def modes_of(score):
+    """Modes of shapes whose displacements are the rows of `score` (s, c)."""
+    score = score - score.mean(0)
+    U, S, _ = np.linalg.svd(score, full_matrices=False)
+    s = len(score)
+    modes = dataset(
+        score=U * np.sqrt(s - 1),
+        standard_deviation=S / np.sqrt(s - 1),
+        explained_variance_ratio=S**2 / (S**2).sum(),
+    )
+    return modes.assign_coords(shape=[f"s{i}" for i in range(s)])
+
+
+def test_a_shape_that_makes_a_mode_alone_and_a_near_copy_are_named():
+    rng = np.random.default_rng(0)
+    size = 0.03 * 0.9 ** np.arange(12)
+    for s in (8, 12, 30):
+        score = size * rng.normal(size=(s, 12))
+        assert check_modes(modes_of(score), 1.0) == {}
+        large, copy = score.copy(), score.copy()
+        large[2] += 1.0
+        (one,) = check_modes(modes_of(large), 1.0)["s2"]
+        assert (one.kind, one.flagged) == ("influential", False)
+        assert one.words.startswith("makes mode 1 almost alone: ")
+        copy[5] = copy[1] + 5e-4 * rng.normal(size=12)
+        assert [*check_modes(modes_of(copy), 1.0)] == ["s1"]
+        assert "nearly the same shape as s5" in check_modes(modes_of(copy), 1.0)["s1"][0].words
+
+
+def test_a_shape_that_makes_a_mode_alone_is_in_the_summary(study):
+    report = study["report"].to_dataset()
+    kinds = ["influential" if name == "brain_01" else "" for name in report["shape"].values]
+    other = study.copy()
+    other["report"] = xr.DataTree(report.assign(warning_kinds=("shape", kinds)))
+    assert "1 influential  brain_01  -> it makes a mode" in tables.run_summary(other)
+
+
+def test_at_most_one_in_a_hundred_clean_collections_has_a_warning_of_its_modes():
+    rng = np.random.default_rng(1)
+    size = 0.03 * 0.7 ** np.arange(10)
+    warned = [bool(check_modes(modes_of(size * rng.normal(size=(8, 10))), 1.0)) for _ in range(200)]
+    assert sum(warned) <= 2

@@ -276,6 +276,14 @@ def test_a_file_written_again_after_it_was_opened_is_an_error(tmp_path):
         result.load()
 
 
+def test_a_file_removed_after_it_was_opened_is_named(tmp_path):
+    store.write(dataset(position=np.zeros((700, 3))), tmp_path / "a.nc", "k")
+    result = netcdf.open_file(tmp_path / "a.nc")
+    (tmp_path / "a.nc").unlink()
+    with pytest.raises(FileNotFoundError, match=r"a\.nc was removed since it was opened: put it"):
+        result.load()
+
+
 def test_a_folder_with_files_of_somebody_else_is_refused_and_not_touched(tmp_path):
     (tmp_path / "original").mkdir()
     (tmp_path / "pca.nc").write_bytes(b"mine")

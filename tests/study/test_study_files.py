@@ -453,7 +453,9 @@ def test_a_file_made_from_a_file_of_another_run_is_skipped(folder):
     path = folder / "registration" / "brain_01.nc"
     data = netcdf.read(path)
     registration = netcdf.attributes(folder / "registration.nc")["task_key"]
-    assert data.attrs["made_from"] == f"registration={registration}"
+    coarse = netcdf.attributes(folder / "coarse/brain_01.nc")["task_key"]
+    made_from = f"registration={registration} coarse/brain_01={coarse}"
+    assert data.attrs["made_from"] == made_from
     store.write(data, path, data.attrs["task_key"], [f"latent={registration}"])
     assert verify(folder)["state"].sel(file="registration/brain_01.nc").item() == "stale"
 

@@ -1,0 +1,337 @@
+"""Coordinate systems: read from every format, converted in one place, refused where unknown."""
+
+import zlib
+from base64 import b64encode
+
+import nibabel as nib
+import numpy as np
+import pytest
+from nibabel.gifti import GiftiCoordSystem, GiftiDataArray, GiftiImage, GiftiMetaData
+
+import s4a
+from s4a import read_mesh, read_shapes, write_mesh
+from s4a.geometry.mesh import as_arrays, as_dataset, volume
+from s4a.input.annotations import read_landmarks, write_landmarks
+from s4a.input.chirality import in_file
+from s4a.input.coordinates import CoordinateSystem, common, in_one_system, transform
+from s4a.input.formats import vtk_bytes, vtp_bytes
+from s4a.input.landmarks import locate
+from s4a.input.raw import sentences
+from s4a.schema import dataset, in_unit
+
+X, T = as_arrays(s4a.synthetic.sphere(200))
+X = (X + 0.3 * np.exp(X * [1, -1, 1])) * [9, 6, 4]  # without symmetry
+CRAS = np.array([12.0, -20, 35])
+DIRECTIONS = np.array([[-1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # of a conformed volume
+LIKE_SLICER = "3D Slicer output. SPACE={}"
+
+
+def system(text, unit="mm"):
+    return CoordinateSystem.of({"coordinate_system": text, "unit": unit})
+
+
+def freesurfer(path, points=X, directions=DIRECTIONS, cras=CRAS, real=0, valid=1):
+    info = {
+        "head": np.array([2, 0, 20]), "valid": f"{valid}  # volume info valid",
+        "filename": "../mri/orig.mgz", "volume": np.array([256] * 3), "voxelsize": np.ones(3),
+        "xras": directions[0], "yras": directions[1], "zras": directions[2], "cras": cras,
+    }  # fmt: skip
+    nib.freesurfer.write_geometry(path, points, T, volume_info=info)
+    flag = b"\0\0\0\2\0\0\0"  # useRealRAS
+    path.write_bytes(path.read_bytes().replace(flag + b"\0\0\0", flag + bytes([real]) + b"\0\0"))
+    return path
+
+
+def gifti(path, spaces=(0, 0), matrix=None, sets=1, **meta):
+    cs = GiftiCoordSystem(*spaces, np.eye(4) if matrix is None else matrix)
+    image = GiftiImage()
+    for _ in range(sets):
+        points = X.astype(np.float32)
+        intent, words = "NIFTI_INTENT_POINTSET", GiftiMetaData(meta)
+        image.add_gifti_data_array(GiftiDataArray(points, intent, coordsys=cs, meta=words))
+    triangles = T.astype(np.int32)
+    image.add_gifti_data_array(GiftiDataArray(triangles, "NIFTI_INTENT_TRIANGLE"))
+    nib.save(image, path)
+    return path
+
+
+def vtp(how):
+    """A .vtp file with SPACE in its field data: ascii, in base64, or appended and by zlib."""
+    text, values = b"LPS\0", vtp_bytes(X, T, {}).decode()
+    kinds = {"ascii": " ".join(map(str, text)), "appended": ""}
+    whole = np.array(len(text), "<u8").tobytes() + text
+    kinds["binary"] = b64encode(whole).decode()
+    at = 'offset="0" ' if how == "appended" else ""
+    field = f'<Array type="String" Name="SPACE" NumberOfTuples="1" {at}format="{how}">'
+    field = f"<FieldData>{field}{kinds[how]}</Array></FieldData>"
+    values = values.replace("<PolyData>", f"<PolyData>{field}", 1)
+    if how == "appended":
+        end = f'<AppendedData encoding="raw">_{whole.decode("latin-1")}</AppendedData></VTKFile>'
+        values = values.replace("</VTKFile>", end)
+    return values.encode("latin-1")
+
+
+def test_every_format_says_its_coordinate_system(tmp_path):
+    moved = np.eye(4)
+    moved[:3, 3] = CRAS
+    axes = {f"VolGeom{a}_{b}": str(DIRECTIONS[i][j]) for i, a in enumerate("XYZ")
+            for j, b in enumerate("RAS")}  # fmt: skip
+    axes |= {f"VolGeomC_{b}": str(c) for b, c in zip("RAS", CRAS, strict=True)}
+    surface = "surface RAS, c_ras 12 -20 35"
+    known = {
+        freesurfer(tmp_path / "a.pial"): surface,
+        freesurfer(tmp_path / "b.pial", real=1): "scanner RAS",
+        freesurfer(tmp_path / "c.pial", valid=0): "surface RAS",
+        gifti(tmp_path / "a.gii"): "RAS, origin unknown",
+        gifti(tmp_path / "b.gii", (1, 1)): "scanner RAS",
+        gifti(tmp_path / "c.gii", (2, 4)): "RAS",
+        gifti(tmp_path / "d.gii", (4, 4)): "MNI152 RAS",
+        gifti(tmp_path / "e.gii", (0, 1), moved): surface,
+        gifti(tmp_path / "f.gii", (0, 3), **axes): surface,
+    }
+    files = {
+        "a.vtk": (vtk_bytes(X, T, {}, LIKE_SLICER.format("LPS")), "LPS"),
+        "b.vtk": (
+            vtk_bytes(X, T, {}).replace(
+                b"POLYDATA\n", b"POLYDATA\nFIELD FieldData 1\nSPACE 1 1 string\n\xc3LPS\n", 1
+            ),
+            "LPS",
+        ),
+        **{f"{how}.vtp": (vtp(how), "LPS") for how in ("ascii", "binary", "appended")},
+        "a.obj": (b"# " + LIKE_SLICER.format("RAS").encode() + b"\nv 0 0 0\nv 1 0 0\nv 0 1 0\n"
+                  b"f 1 2 3\n", "RAS"),
+    }  # fmt: skip
+    for name, (data, text) in files.items():
+        (tmp_path / name).write_bytes(data)
+        known[tmp_path / name] = text
+    for path, text in known.items():
+        points, _, attrs = read_mesh(path)
+        assert (attrs["coordinate_system"], attrs["unit"]) == (text, "mm"), path.name
+        if path.suffix != ".obj":
+            assert points == pytest.approx(X, abs=1e-4), path.name
+    with pytest.raises(ValueError, match=r"one set of points .* found 2 and 1: save each surface"):
+        read_mesh(gifti(tmp_path / "two.gii", sets=2))
+
+
+def test_surface_ras_becomes_scanner_ras_for_any_direction_of_the_voxels(tmp_path):
+    # FreeSurfer: scanner RAS = Norig inv(Torig) surface RAS, both of the voxels
+    directions = DIRECTIONS @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    voxels, size = np.array([256, 200, 180]), np.array([1.0, 0.8, 1.2])
+    norig, torig = np.eye(4), np.eye(4)
+    for affine, rows, centre in ((norig, directions, CRAS), (torig, DIRECTIONS, np.zeros(3))):
+        affine[:3, :3] = np.transpose(rows) * size
+        affine[:3, 3] = centre - affine[:3, :3] @ (voxels / 2)
+    attrs = read_mesh(freesurfer(tmp_path / "a.pial", directions=directions))[2]
+    M = transform(CoordinateSystem.of(attrs), CoordinateSystem("RAS", "scanner", "mm"))
+    assert pytest.approx(norig @ np.linalg.inv(torig), abs=1e-6) == M
+
+
+def test_two_known_systems_are_converted_and_back():
+    texts = ["RAS", "LPS", "PIR", "LAS", "scanner RAS", "surface RAS, c_ras 1.5 -20 35"]
+    P = np.c_[X[:5], np.ones(5)]
+    for a in texts:
+        for b in texts:
+            there, back = transform(system(a), system(b, "m")), transform(system(b, "m"), system(a))
+            assert P @ there.T @ back.T == pytest.approx(P)
+    assert (transform(system("RAS"), system("LPS", "cm")) @ [10, 20, 30, 1])[:3].tolist() == [
+        -1, -2, 3]  # fmt: skip
+    assert np.linalg.det(transform(system("RAS"), system("LAS"))) < 0
+
+
+def test_what_is_unknown_is_not_converted():
+    unknown = [("", ""), ("RAS", ""), ("", "mm"), ("RAS, origin unknown", "mm"),
+               ("surface RAS", "mm"), ("MNI152 RAS", "mm")]  # fmt: skip
+    scanner = system("scanner RAS")
+    for text, unit in unknown:
+        assert transform(system(text, unit), scanner) is None
+        assert transform(system(text, unit), system(text, unit)).tolist() == np.eye(4).tolist()
+        with pytest.raises(ValueError, match=r"scanner RAS, mm: a; .*: b: coordinate_system= and"):
+            common({"a": scanner, "b": system(text, unit)}, origin=True)
+    assert transform(system("MNI152 RAS"), system("LPS")) is not None  # of Slicer: any image
+    filled = [system(text, unit).filled(system("scanner RAS")) for text, unit in unknown[:4]]
+    assert {str(one) for one in filled} == {"scanner RAS, mm", "RAS, mm"}
+    with pytest.raises(ValueError, match=r"one coordinate system of RAS, .* needed, found 'RAR'"):
+        system("RAR")
+
+
+def test_a_mesh_is_converted_with_its_landmarks_and_faces_outward():
+    mesh = as_dataset(X, T, {"coordinate_system": "LAS", "unit": "m", "area": 2.0})
+    mesh = s4a.with_landmarks(
+        in_unit(mesh, "m"), dataset(landmark_name=["a"], landmark_position=X[:1])
+    )
+    ras = as_dataset(X, T, {"coordinate_system": "RAS", "unit": "mm"})
+    found = in_one_system({"a": ras, "b": ras, "c": mesh})["c"]
+    assert found["position"].values == pytest.approx(X * [-1000, 1000, 1000])
+    assert found["guide_position"].values == pytest.approx(found["position"].values[:1])
+    assert found["position"].attrs["units"] == "mm"
+    assert found.attrs["area"] == pytest.approx(2e6)
+    assert volume(found["position"].values, found["corner_vertex"].values) > 0
+    assert "converted from LAS, m to RAS, mm" in found.attrs["reason"]
+    assert in_file(found, found["position"].values) == pytest.approx(X)
+    assert in_file(found, X, back=True) == pytest.approx(X * [-1000, 1000, 1000])
+
+
+def test_a_collection_is_converted_or_told_what_is_missing(tmp_path):
+    meshes = {f"s{i}": as_dataset(X * [-1, -1, 1] if i == 2 else X, T) for i in range(3)}
+    for name, text in {"s0": "RAS", "s1": "RAS", "s2": "LPS"}.items():
+        meshes[name].attrs |= system(text).attrs
+    tree = read_shapes(meshes, compare=False)
+    assert tree["original/s2/position"].values == pytest.approx(X)
+    assert tree["report/coordinate_system"].values.tolist() == ["RAS, mm", "RAS, mm", "LPS, mm"]
+    write_mesh(tmp_path / "s2.ply", X, T)
+    with pytest.raises(ValueError, match=r"found RAS, mm: s0, s1; unknown: s2: coordinate_system="):
+        s4a.analyse(meshes | {"s2": tmp_path / "s2.ply"})
+    with pytest.raises(ValueError, match="unit must be one of um, mm, cm, m, in; found 'inch'"):
+        s4a.analyse(meshes, unit="inch")
+
+
+def test_a_study_of_files_in_two_systems_is_that_of_files_in_one(tmp_path):
+    brains = s4a.synthetic.brains(3, 200)["original"]
+    options = {"n_coarse": 100, "k": 10, "k_init": 6, "intersections": False}
+    score, remarks = [], []
+    for folder, texts in {"one": ["RAS"] * 3, "two": ["RAS", "RAS", "LPS"]}.items():
+        (tmp_path / folder).mkdir()
+        for (name, mesh), text in zip(brains.items(), texts, strict=True):
+            Y = mesh["position"].values * ([-1, -1, 1] if text == "LPS" else 1)
+            faces = mesh["corner_vertex"].values
+            write_mesh(tmp_path / folder / f"{name}.vtk", Y, faces, coordinate_system=text)
+        study = s4a.analyse(tmp_path / folder, **options)
+        score.append(study["pca/score"].values)
+        remarks.append(study["report"].attrs["remarks"])
+    assert score[0] == pytest.approx(score[1], abs=1e-9)
+    assert "1 of 3 shapes were converted to RAS: brain_03 (LPS)" in remarks[1]
+    assert "converted" not in remarks[0]
+
+
+def test_landmarks_lie_on_the_surface_whatever_the_two_files_say(tmp_path):
+    def marks(text, points, unit="mm"):
+        return dataset(system(text, unit).attrs, landmark_name=list("abcd"),
+                       landmark_position=points[[3, 40, 90, 150]])  # fmt: skip
+
+    surface = as_dataset(X, T, read_mesh(freesurfer(tmp_path / "a.pial"))[2])
+    cases = [
+        (marks("LPS", (X + CRAS) * [-1, -1, 1]), surface),  # as Slicer has them of the scan
+        (marks("", X, ""), surface),
+        (marks("", X + CRAS, ""), surface),  # of FreeView: reported
+        (marks("LPS", X), as_dataset(X, T)),
+        (marks("LPS", X * [-1, -1, 1]), as_dataset(X, T)),
+        (marks("RAS", X / 10, "cm"), as_dataset(X, T, system("RAS").attrs)),
+    ]
+    for points, mesh in cases:
+        assert locate(points, mesh)["landmark_distance"].values == pytest.approx(0, abs=1e-4)
+
+
+HEAD = "# Markups fiducial file version = 4.11\n"
+COLUMNS = "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
+FCSV = "n_{0},{1},{2},{3},0,0,0,1,1,1,0,{4},,\n"
+
+
+def test_landmark_files_of_other_programs_are_read(tmp_path):
+    P, names = np.array([[1.5, 2, 3], [-4, 5.25, 6]]), ["a", "b"]
+    rows = list(zip(range(2), *P.T.tolist(), names, strict=True))
+    fcsv = "".join(FCSV.format(*row) for row in rows)
+    plain = "".join("{1} {2} {3}\n".format(*row) for row in rows)
+    named = "".join("{4} {1} {2} {3}\n".format(*row) for row in rows)
+    csv = "".join("{4},{1},{2},{3},{5},1\n".format(*row, int(row[0] < 2)) for row in rows)
+    files = {
+        "lps.fcsv": (f"{HEAD}# CoordinateSystem = LPS\n{COLUMNS}{fcsv}", "LPS", names),
+        "one.fcsv": (f"{HEAD}# CoordinateSystem = 1\n{COLUMNS}{fcsv}", "LPS", names),
+        "old.fcsv": (f"{HEAD}# CoordinateSystem = 0\n{COLUMNS}{fcsv}", "RAS", names),
+        "lps.csv": (f"label,l,p,s,defined,selected\n{csv}c,0,0,0,0,1\n", "LPS", names),
+        "ras.csv": (f"label,r,a,s,defined,selected\n{csv}", "RAS", names),
+        "a.tps": (f"LM3=2\n{plain}ID=x\n", "", ["1", "2"]),
+        "scaled.tps": (f"LM3=2\n{plain}SCALE=1.0\n", "", ["1", "2"]),
+        "two.tps:x": (f"LM3=2\n{plain}ID=x\n\nLM3=1\n0 0 0\nID=y\n", "", ["1", "2"]),
+        "a.pts": (f"Version 1.0\n2\n{named}", "", names),
+        "b.pts": (f"version: 1\nn_points:  2\n{{\n{plain}}}\n", "", ["1", "2"]),
+        "a.json": (
+            str([{"id": n, "coordinates": p} for n, p in zip(names, P.tolist(), strict=True)])
+            .replace("'", '"'), "", names),
+    }  # fmt: skip
+    for name, (text, axes, expected) in files.items():
+        (tmp_path / name.partition(":")[0]).write_text(text)
+        found = read_landmarks(tmp_path / name)
+        assert found["landmark_position"].values == pytest.approx(P), name
+        assert found["landmark_name"].values.tolist() == expected, name
+        assert found.attrs == (system(axes).attrs if axes else {}), name
+    wrong = {
+        "two.tps": "one specimen needed, found x, y: choose one as FILE.tps:x",
+        "a.tps": "2 points of 3 coordinates needed, found 1",
+        "a.pts": "3 points of 3 coordinates needed, found 2",
+        "lps.fcsv": "found 'XYZ'",
+    }
+    (tmp_path / "a.tps").write_text("LM=2\n1 2\nID=x\n")
+    (tmp_path / "a.pts").write_text(f"Version 1.0\n3\n{plain}")
+    (tmp_path / "lps.fcsv").write_text(f"# CoordinateSystem = XYZ\n{COLUMNS}{fcsv}")
+    for name, words in wrong.items():
+        with pytest.raises(ValueError, match=words):
+            read_landmarks(tmp_path / name)
+
+
+def test_a_written_mesh_lies_where_the_scan_has_it(tmp_path):
+    given = {
+        "RAS": X, "LPS": X * [-1, -1, 1], "LAS": X * [-1, 1, 1],
+        "surface RAS, c_ras 12 -20 35": X - CRAS,
+    }  # fmt: skip
+    for text, points in given.items():
+        triangles = T[:, ::-1] if text == "LAS" else T
+        for end in ("ply", "obj", "off", "stl", "vtk", "vtp", "gii"):
+            path = tmp_path / f"a.{end}"
+            write_mesh(path, points / 10, triangles, coordinate_system=text, unit="cm")
+            Y, S, attrs = read_mesh(path)
+            M = transform(CoordinateSystem.of(attrs), system("RAS"))
+            scan = Y @ M[:3, :3].T + M[:3, 3]
+            assert np.sort(scan, 0) == pytest.approx(np.sort(X, 0), abs=1e-4), (text, end)
+            S = S[:, ::-1] if np.linalg.det(M) < 0 else S
+            assert volume(scan, S) == pytest.approx(volume(X, T), rel=1e-5), (text, end)
+        image = nib.load(tmp_path / "a.gii")
+        assert image.agg_data("pointset") == pytest.approx(X, abs=1e-4)
+
+
+def test_written_markups_lie_where_the_scan_has_them(tmp_path):
+    for text, unit, factor in (("surface RAS, c_ras 12 -20 35", "mm", 1), ("PIR", "m", 0.001)):
+        own = system(text, unit)
+        M = transform(system("scanner RAS"), own)
+        given = X[:3] @ M[:3, :3].T + M[:3, 3]
+        marks = dataset(own.attrs, landmark_name=list("abc"), landmark_position=given)
+        write_landmarks(tmp_path / "a.mrk.json", marks)
+        found = read_landmarks(tmp_path / "a.mrk.json")
+        assert found.attrs == system("RAS").attrs
+        assert found["landmark_position"].values == pytest.approx(X[:3])
+        assert np.linalg.det(M[:3, :3]) == pytest.approx(factor**3)
+
+
+def test_messages_end_at_the_end_of_a_sentence():
+    text = "3 of 6 shapes were converted to RAS (a; b), and the others were not; c. And so on."
+    ends = {sentences(text, n) for n in range(1, 100)}
+    assert ends == {text[: text.index(";", 60)], text[: text.index(" And")], text}
+
+
+def test_the_command_prints_the_system_of_each_file(tmp_path, capsys):
+    freesurfer(tmp_path / "a.pial")
+    write_mesh(tmp_path / "b.vtk", X, T, coordinate_system="LPS", unit="mm")
+    write_mesh(tmp_path / "c.ply", X, T)
+    from s4a.cli import main
+
+    assert main(["check", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "surface RAS, c_ras 12 -20 35, mm" in out
+    assert "LPS, mm" in out
+    assert "needed, found" in " ".join(out.split())
+    assert main(["check", str(tmp_path), "--coordinate-system", "RAS", "--unit", "mm"]) == 0
+    assert "found" not in capsys.readouterr().out
+
+
+def test_a_compressed_field_is_read(tmp_path):
+    text = b"LPS\0"
+    packed = zlib.compress(text)
+    sizes = np.array([1, len(text), 0, len(packed)], "<u8").tobytes()
+    field = (
+        '<FieldData><Array type="String" Name="SPACE" format="binary">'
+        f"{b64encode(sizes).decode()}{b64encode(packed).decode()}</Array></FieldData>"
+    )
+    from s4a.input.formats import VtkXml
+
+    head = '<VTKFile type="PolyData" byte_order="LittleEndian" header_type="UInt64" '
+    file = f'{head}compressor="vtkZLibDataCompressor"><PolyData>{field}</PolyData></VTKFile>'
+    assert VtkXml(file.encode()).strings("SPACE")[0] == "LPS"
