@@ -109,6 +109,10 @@ def test_every_format_says_its_coordinate_system(tmp_path):
         assert (attrs["coordinate_system"], attrs["unit"]) == (text, "mm"), path.name
         if path.suffix != ".obj":
             assert points == pytest.approx(X, abs=1e-4), path.name
+    image = nib.load(tmp_path / "a.gii")
+    image.darrays[1].coordsys = GiftiCoordSystem(1, 1)  # of the triangles, which have none
+    nib.save(image, tmp_path / "g.gii")
+    assert read_mesh(tmp_path / "g.gii")[2]["coordinate_system"] == "RAS, origin unknown"
     with pytest.raises(ValueError, match=r"one set of points .* found 2 and 1: save each surface"):
         read_mesh(gifti(tmp_path / "two.gii", sets=2))
 
@@ -187,7 +191,8 @@ def test_a_collection_is_converted_or_told_what_is_missing(tmp_path):
 
 def test_a_study_of_files_in_two_systems_is_that_of_files_in_one(tmp_path):
     brains = s4a.synthetic.brains(3, 200)["original"]
-    options = {"n_coarse": 100, "k": 10, "k_init": 6, "intersections": False}
+    options = {"n_coarse": 100, "k": 10, "k_init": 6, "intersections": False,
+               "include_flagged": True}  # fmt: skip
     score, remarks = [], []
     for folder, texts in {"one": ["RAS"] * 3, "two": ["RAS", "RAS", "LPS"]}.items():
         (tmp_path / folder).mkdir()
@@ -224,6 +229,16 @@ def test_landmarks_lie_on_the_surface_whatever_the_two_files_say(tmp_path):
 HEAD = "# Markups fiducial file version = 4.11\n"
 COLUMNS = "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
 FCSV = "n_{0},{1},{2},{3},0,0,0,1,1,1,0,{4},,\n"
+
+
+def test_landmarks_that_fit_a_mesh_in_two_directions_are_reported(caplog):
+    points = {"landmark_name": list("ab"), "landmark_position": X[[3, 40]]}
+    both = as_dataset(np.r_[X, X * [-1, -1, 1]], np.r_[T, T + len(X)])
+    locate(dataset(system("LPS").attrs, **points), both)
+    assert "and a mesh in RAS with" in caplog.text
+    caplog.clear()
+    locate(dataset(system("LPS").attrs, **points), as_dataset(X, T))
+    assert not caplog.text
 
 
 def test_landmark_files_of_other_programs_are_read(tmp_path):
@@ -263,6 +278,10 @@ def test_landmark_files_of_other_programs_are_read(tmp_path):
     (tmp_path / "a.tps").write_text("LM=2\n1 2\nID=x\n")
     (tmp_path / "a.pts").write_text(f"Version 1.0\n3\n{plain}")
     (tmp_path / "lps.fcsv").write_text(f"# CoordinateSystem = XYZ\n{COLUMNS}{fcsv}")
+    markups = '{"markups": [{"coordinateSystem": "LPS", "controlPoints": [%s]}]}'
+    point = '{"position": [1, 2, 3], "coordinateSystem": "RAS"}'
+    (tmp_path / "a.mrk.json").write_text(markups % point)
+    wrong["a.mrk.json"] = "one coordinateSystem, LPS or RAS, needed, found LPS, RAS"
     for name, words in wrong.items():
         with pytest.raises(ValueError, match=words):
             read_landmarks(tmp_path / name)
