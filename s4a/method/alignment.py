@@ -14,7 +14,6 @@ import xarray as xr
 from scipy.spatial import cKDTree
 
 from s4a.geometry.align import (
-    DISTINCT,
     N_POSES,
     ROUGH,
     RigidTransform,
@@ -33,10 +32,11 @@ from s4a.options import check
 from s4a.schema import POSE
 
 N_VOTERS = 6
-# of sqrt(area): poses fit alike if the root of the difference of their squared residuals is below
-# it to a quarter of the voters; shapes of a collection differ from each other by about 0.04.  With
-# fewer vertices than ENOUGH their spacing hides part of the difference
-ALIKE, ENOUGH = 0.023, 500
+# poses fit alike if the root mean square residual to the voters is below ALIKE times that of the
+# best, and to a quarter of the voters the root of the difference of the squared residuals is below
+# NEAR of sqrt(area); shapes of a collection differ from each other by about 0.04.  With fewer
+# vertices than ENOUGH their spacing hides part of the difference
+ALIKE, NEAR, ENOUGH = 1.14, 0.023, 500
 _COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
 IDENTITY = np.eye(3), np.zeros(3)
 
@@ -166,24 +166,18 @@ def _after(first: RigidTransform, second: RigidTransform) -> RigidTransform:
 
 def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Alignment:
     """Choose the pose with the least mean squared residual to the voters."""
-    rows, rotations = [], []
+    rows = []
     for other, onto in voters.values():
         starts = [relative_transform(pose, onto) for pose in found]
         ends = icp_each(source.cloud, other.cloud, starts, tolerance=5 * ROUGH)
         rows.append([residual**2 for *_, residual in ends])
-        rotations.append([R for R, *_ in ends])
     squared = np.array(rows)  # (voters, poses)
     order = np.argsort(squared.mean(0), kind="stable")
     squared, (R, t) = squared[:, order], found[order[0]]
-    limit = ALIKE**2 * min(1.0, len(source.X) / ENOUGH)
-    turned = np.array(rotations)[:, order]  # (voters, poses, 3, 3)
-    # the trace of a rotation is 1 + 2 cos(angle)
-    cosines = (np.einsum("vpij,vij->vp", turned, turned[:, 0]) - 1) / 2
-    difference = squared - squared[:, :1]
-    # a pose from which ICP ends at the best one is none of its own
-    difference[:, 1:][cosines[:, 1:] > np.cos(np.deg2rad(DISTINCT))] = 1.0
-    alike = np.quantile(difference, 0.25, axis=0) < limit
-    fits = tuple(np.sqrt(squared.mean(0)[alike]).tolist())
+    limit, residual = NEAR**2 * min(1.0, len(source.X) / ENOUGH), np.sqrt(squared.mean(0))
+    alike = np.quantile(squared - squared[:, :1], 0.25, axis=0) < limit
+    alike &= residual <= ALIKE * residual[0]
+    fits = tuple(residual[alike].tolist())
     if len(fits) < 2 or _differs(source, voters, (R, t)):
         return Alignment(R, t, fits[:1])
     second = found[order[np.flatnonzero(alike)[1]]][0]
