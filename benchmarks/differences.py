@@ -294,10 +294,11 @@ steps. Tests compare `isometric` and the linear program (`tests/method/test_pape
 a cycle, pyFM 1.3.1 multiplies $C_{{ij}} C_{{jk}} C_{{ki}}$. As $C_{{ij}}$ maps functions from $i$
 to $j$, that product is not $I$ for consistent maps; S4A multiplies $C_{{ki}} C_{{jk}} C_{{ij}}$.
 
-With `isometric=True` the energies of eq. 5 are 11 to 27 times smaller on the brains and 43 to 64
+With `isometric=True` the energies of eq. 5 are 11 to 28 times smaller on the brains and 32 to 63
 times on the faces (as they are in the model), since orthogonal maps have $D_i$ near $I$. The median
-is brain_04 in place of brain_03, and identity007 in place of identity011. The match of eq. 7 moves
-by 0.16 and 0.12 % of the square root of the area on average.
+is brain_04 in place of brain_03, and identity006 in place of identity007. The match of eq. 7 moves
+by 0.19 and 0.12 % of the square root of the area on average.
+
 **The norm of eq. 5.** The paper writes the norm of the Sobolev space $H_0^2$, in which $\\lVert f
 \\rVert = \\lVert \\Lambda^0 f \\rVert$ with the eigenvalues $\\Lambda^0$ of the limit shape. It
 does not say between which spaces $D_i - I$ is an operator. `norm` offers five interpretations.

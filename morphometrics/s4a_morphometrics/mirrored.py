@@ -84,7 +84,7 @@ def combine(comparisons: Comparisons) -> dict[str, xr.Dataset]:
     dict of str to Dataset
         Subject -> ``chirality(reference)``, for :func:`s4a.input.chirality.mean_chirality`: the sum
         over the n common structures, divided by sqrt(n), which keeps the variance of the noise.
-        NaN without common structures.
+        ``fit`` and ``fit_mirrored`` are means.  NaN without common structures.
 
     Examples
     --------
@@ -104,25 +104,29 @@ def combine(comparisons: Comparisons) -> dict[str, xr.Dataset]:
             for reference in comparison["reference"].values
         }
     )
-    table = chirality_table(comparisons, subjects, references)
-    valid = np.isfinite(table)
-    n = valid.sum(0)
-    whole = np.where(n, np.where(valid, table, 0).sum(0) / np.sqrt(np.maximum(n, 1)), np.nan)
+    total = {}
+    for key, power in ("chirality", 0.5), ("fit", 1), ("fit_mirrored", 1):
+        table = table_of(key, comparisons, subjects, references)
+        n = np.isfinite(table).sum(0)
+        total[key] = np.where(n, np.nansum(table, axis=0) / np.maximum(n, 1) ** power, np.nan)
     return {
-        name: dataset(chirality=row).assign_coords(reference=references)
-        for name, row in zip(subjects, whole, strict=True)
+        name: dataset(**{key: rows[i] for key, rows in total.items()}).assign_coords(
+            reference=references
+        )
+        for i, name in enumerate(subjects)
     }
 
 
-def chirality_table(
-    comparisons: Comparisons, subjects: list[str], references: list[str]
+def table_of(
+    key: str, comparisons: Comparisons, subjects: list[str], references: list[str]
 ) -> np.ndarray:
-    """Return the chirality of every structure ``(structures, subjects, references)``, or NaN."""
+    """Return a variable of every structure ``(structures, subjects, references)``, or NaN."""
     table = np.full((len(comparisons), len(subjects), len(references)), np.nan)
     for k, by_subject in enumerate(comparisons.values()):
         for name, comparison in by_subject.items():
-            row = comparison["chirality"].reindex(reference=references)
-            table[k, subjects.index(name)] = row.values
+            if key in comparison:
+                row = comparison[key].reindex(reference=references)
+                table[k, subjects.index(name)] = row.values
     return table
 
 
@@ -146,7 +150,7 @@ def mirrored_subjects(
         return dict.fromkeys(combined, np.nan), *mirrored_shapes(combined)
     names, mean = list(combined), mean_chirality(combined)
     chirality = dict(zip(names, mean.tolist(), strict=True))
-    table = chirality_table(comparisons, names, names) * np.where(mean < 0, -1, 1)
+    table = table_of("chirality", comparisons, names, names) * np.where(mean < 0, -1, 1)
     valid = np.isfinite(table)
     each = np.where(valid, table, 0).sum(2) / np.maximum(valid.sum(2), 1)  # (structures, subjects)
     mixed = (each <= -OTHER_SIDE).any(0) & (each >= OTHER_SIDE).any(0)

@@ -23,7 +23,6 @@ from s4a.geometry.align import (
     poses,
     realign,
     relative_transform,
-    residual_of,
     rigid_transform,
 )
 from s4a.input.plausibility import flag
@@ -122,10 +121,8 @@ def pair_transform(
 
 def alignment_residual(source: Basis, target: Basis, transform: RigidTransform) -> float:
     """Root mean square distance of nearest vertices, in both directions, after a transform."""
-    X, Y = (
-        basis.cloud._replace(normals=None, tree=cKDTree(basis.X)) for basis in (source, target)
-    )
-    return residual_of(icp(X, Y, *transform, iterations=1))
+    M, N = (b.cloud._replace(normals=None, tree=cKDTree(b.X)) for b in (source, target))
+    return float(icp(M, N, *transform, iterations=1)[2])
 
 
 def align_onto(

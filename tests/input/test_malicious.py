@@ -349,7 +349,8 @@ def readers(study):
                 if name.startswith("_") or not inspect.isfunction(function) or not is_own:
                     continue
                 parameters = inspect.signature(function).parameters.values()
-                paths = [p.name for p in parameters if "Path" in str(p.annotation)]
+                kinds = {p.name: str(p.annotation) for p in parameters}
+                paths = [n for n, kind in kinds.items() if re.match("[^[]*Path", kind)]
                 needed = [p.name for p in parameters if p.default is p.empty and p.kind < 2]
                 if not paths or NOT_READERS.match(name) or {*needed} - {*filled, *paths}:
                     continue
