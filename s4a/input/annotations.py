@@ -23,6 +23,8 @@ from s4a.input.raw import check_there, content, npy, npz, reading, shown, text_o
 from s4a.options import MILLIMETRES
 from s4a.schema import dataset, require, unit_of
 
+log = logging.getLogger(__name__)
+
 LONGEST = 255  # characters of a name, as NumPy pads each text to the longest
 _MARKUPS = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/"
@@ -58,7 +60,7 @@ def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
     file = Path(f"{before}.npz" if name else before)
     check_there(file)
     kind = Path(file.name.lower().removesuffix(".gz")).suffix
-    readers = {".npy": npy, ".gii": _gifti_labels, ".annot": _annot_labels}
+    readers = {".npy": npy, ".gii": _gifti_vector, ".annot": _annot_labels}
     with reading(path, "labels"):
         data = content(file)
         if kind == ".npz" or zipfile.is_zipfile(io.BytesIO(data)):
@@ -104,13 +106,14 @@ def _npz_labels(data, file, name, n):
     return columns[fitting[0]]
 
 
-def _gifti_labels(data):
+def _gifti_vector(data, intent="LABEL"):
+    """The array of labels, if there is one, or of one dimension."""
     arrays = gifti_arrays(data)
-    labels = [values for intent, values in arrays if intent == "LABEL"]
-    labels = labels or [values for _, values in arrays if values.ndim == 1]
-    if not labels:
-        raise ValueError("a GIFTI array of labels needed, found none")
-    return labels[0]
+    found = [values for of, values in arrays if of == intent]
+    found = found or [values for _, values in arrays if values.ndim == 1]
+    if not found:
+        raise ValueError("a GIFTI array of one dimension needed, found none")
+    return found[0]
 
 
 class _Cursor:
@@ -142,8 +145,7 @@ def _annot_labels(data):
     """
     file = _Cursor(data)
     vertex, annotation = file.numbers(2 * file.number()).reshape(-1, 2).T
-    if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
-        raise ValueError(f"every vertex from 0 to {len(vertex) - 1} expected once")
+    _check_vertices(vertex)
     if not file.number():
         raise ValueError("a colour table expected, found none")
     row_of_colour = _colour_table(file)
@@ -280,38 +282,23 @@ def _text_labels(data):
 
 def _cells(rows, at, has_head):
     """Cells of a column by line, in the order of the column ``vertex`` if there is one."""
-    n, order, head = len(next(iter(rows.values()))), None, []
-    if has_head:
-        head = [cell.lower() for cell in rows.pop(next(iter(rows)))]
-        order = _order_of_vertices(head, rows) if n > 1 else None
+    n = len(next(iter(rows.values())))
+    head = [cell.lower() for cell in rows.pop(next(iter(rows)))] if has_head else []
     _check_cells(rows, n, 1 + at)
     lines = list(rows)
-    return {lines[i]: rows[lines[i]][at] for i in (range(len(lines)) if order is None else order)}
+    if n > 1 and "vertex" in head:
+        column = head.index("vertex")
+        _check_cells(rows, n, 1 + column)
+        vertex = np.array([_number_of(row[column], line) for line, row in rows.items()])
+        _check_vertices(vertex)
+        lines = [lines[i] for i in np.argsort(vertex)]
+    return {line: rows[line][at] for line in lines}
 
 
-def _order_of_vertices(head, rows):
-    """Order of the rows of a table by its column ``vertex``; None if there is no such column.
-
-    Parameters
-    ----------
-    head : list of str
-        Names of the columns, in lower case.
-    rows : dict of int to list of str
-        Cells of each row, by line in the file.
-
-    Raises
-    ------
-    ValueError
-        If the column does not have every index from 0 once.
-    """
-    if "vertex" not in head:
-        return None
-    at = head.index("vertex")
-    _check_cells(rows, len(head), 1 + at)
-    vertex = np.array([_number_of(row[at], line) for line, row in rows.items()])
+def _check_vertices(vertex):
+    """Raise ValueError unless every vertex is there once."""
     if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
-        raise ValueError(f"the column 'vertex' needs every index from 0 to {len(vertex) - 1} once")
-    return np.argsort(vertex)
+        raise ValueError(f"every vertex from 0 to {len(vertex) - 1} needed once")
 
 
 def read_landmarks(path: Path | str) -> xr.Dataset:
@@ -602,8 +589,6 @@ def labels_of_file(
     return np.asarray(labels)[vertex], int(dropped.sum())
 
 
-log = logging.getLogger(__name__)
-
 _CURV = b"\xff\xff\xff"  # first bytes of FreeSurfer's curvature files
 SUFFIXES = (".npy", ".npz", ".ply", ".csv", ".txt", ".gii")
 
@@ -819,10 +804,7 @@ def _values(data, file, name):
     if file.endswith(".npy"):
         return npy(data)
     if file.endswith(".gii"):
-        vectors = [values for _, values in gifti_arrays(data) if values.ndim == 1]
-        if not vectors:
-            raise ValueError("a GIFTI array of one dimension expected, found none")
-        return vectors[0]
+        return _gifti_vector(data, intent=None)
     return _column(text_of(data), name)
 
 

@@ -187,7 +187,7 @@ def test_a_collection_is_converted_or_told_what_is_missing(tmp_path):
 
 def test_a_study_of_files_in_two_systems_is_that_of_files_in_one(tmp_path):
     brains = s4a.synthetic.brains(3, 200)["original"]
-    options = {"n_coarse": 100, "k": 10, "k_init": 6, "intersections": False}
+    options = {"n_coarse": 100, "k": 10, "k_init": 6, "quality_control": "off"}
     score, remarks = [], []
     for folder, texts in {"one": ["RAS"] * 3, "two": ["RAS", "RAS", "LPS"]}.items():
         (tmp_path / folder).mkdir()
