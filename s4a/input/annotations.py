@@ -335,10 +335,15 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
             text, reader = _specimen(text, specimen), _tps_points
         elif re.match(r"\s*version\b", text, re.I):
             reader = _pts_points
-        names, points, system, curve, closed = (reader or _table_points)(text)
-        points = np.array(points, float).reshape(-1, 3)
-        if len(points) == 0 or not np.isfinite(points).all():
-            raise ValueError(f"points with finite coordinates needed, found {len(points)}")
+        system, rows = (reader or _table_points)(text)
+        sizes = {len(position) for _, position, *_ in rows}
+        if sizes != {3}:
+            raise ValueError(f"points of 3 coordinates needed, found {len(rows)} of {sizes or 0}")
+        # name, position, curve, closed
+        names, positions, curve, closed = zip(*((*row, "", False)[:4] for row in rows), strict=True)
+        points = np.array(positions, float)
+        if not np.isfinite(points).all():
+            raise ValueError("points with finite coordinates needed")
         single = [name for name, count in Counter(curve).items() if name and count < 2]
         if single:
             raise ValueError(f"a curve needs at least two points; {single[0]!r} has one")
@@ -372,30 +377,26 @@ def _tps_points(text):
     others = [line for line in lines[n:] if not re.match(r"(?i)(ID|IMAGE|SCALE|COMMENT)\s*=", line)]
     if others:
         raise ValueError(f"{n} points and their ID needed, found the line {others[0][:40]!r}")
-    return _numbered(points, n, float(scale[1]) if scale else 1.0)
+    factor = float(scale[1]) if scale else 1.0
+    return CoordinateSystem(), _counted([("", factor * np.array(p, float)) for p in points], n)
 
 
 def _pts_points(text):
     """Points of IDAV's Landmark editor, or of other files that begin with a version."""
     head, *lines = [line.strip() for line in text.splitlines()[1:] if line.strip(" \t{}")]
     rows = [line.split() for line in lines]
-    names = [row.pop(0) if len(row) == 4 else "" for row in rows]
-    return names, *_numbered(rows, int(head.split()[-1]))[1:]
+    rows = [(row[0], row[1:]) if len(row) == 4 else ("", row) for row in rows]
+    return CoordinateSystem(), _counted(rows, int(head.split()[-1]))
 
 
-def _numbered(points, n, scale=1.0):
-    """Landmarks of unknown names and coordinate system; ValueError unless n points in 3D."""
-    if len(points) != n or any(len(point) != 3 for point in points):
-        found = {len(point) for point in points}
-        raise ValueError(f"{n} points of 3 coordinates needed, found {len(points)} of {found}")
-    points = scale * np.array(points, float).reshape(-1, 3)
-    return [""] * n, points, CoordinateSystem(), [""] * n, []
+def _counted(rows, n):
+    if len(rows) != n:
+        raise ValueError(f"{n} points needed, found {len(rows)}")
+    return rows
 
 
 def _scalismo_points(text):
-    marks = json.loads(text)
-    points = [mark["coordinates"] for mark in marks]
-    return [mark["id"] for mark in marks], *_numbered(points, len(points))[1:]
+    return CoordinateSystem(), [(mark["id"], mark["coordinates"]) for mark in json.loads(text)]
 
 
 def _slicer_points(text):
@@ -417,19 +418,16 @@ def _slicer_points(text):
             (p.get("label", ""), p["position"], curve, m.get("type") == "ClosedCurve")
             for p in points
         ]
-    labels, positions, curves, closed = zip(*rows, strict=True) if rows else ((),) * 4
     units = {u for m in lists for u in np.ravel(m.get("coordinateUnits") or "mm").tolist()}
     if len(units) != 1 or not units <= {*MILLIMETRES}:
         raise ValueError(f"one of {', '.join(MILLIMETRES)} as unit needed, found {sorted(units)}")
-    system = CoordinateSystem(systems.pop(), "", units.pop())
-    return labels, positions, system, curves, closed
+    return CoordinateSystem(systems.pop(), "", units.pop()), rows
 
 
 def _meshlab_points(text):
     points = [p for p in xml(text).iter("point") if p.get("active") != "0"]
-    names = [p.get("name", "") for p in points]
-    positions = [[p.get(axis) for axis in "xyz"] for p in points]
-    return names, positions, CoordinateSystem(), [""] * len(names), []
+    rows = [(p.get("name", ""), [p.get(axis) for axis in "xyz"]) for p in points]
+    return CoordinateSystem(), rows
 
 
 def _table_points(text):
@@ -461,16 +459,12 @@ def _table_points(text):
         raise ValueError(f"the columns name, x, y and z needed, found {', '.join(header)}")
     used = [i for i in (*x, name, curve, closed) if i is not None]
     _check_cells(rows, len(head), 1 + max(used))
-    names, curves, is_closed = (
-        ["" if i is None else row[i] for row in rows.values()] for i in (name, curve, closed)
-    )
-    return (
-        names,
-        [[_number_of(row[i], line) for i in x] for line, row in rows.items()],
-        system,
-        curves,
-        [c.lower() in ("1", "true", "yes") for c in is_closed],
-    )
+    points = []
+    for line, row in rows.items():
+        label, of_curve, is_closed = ("" if i is None else row[i] for i in (name, curve, closed))
+        position = [_number_of(row[i], line) for i in x]
+        points.append((label, position, of_curve, is_closed.lower() in ("1", "true", "yes")))
+    return system, points
 
 
 def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:

@@ -256,8 +256,8 @@ def test_landmark_files_of_other_programs_are_read(tmp_path):
         assert found.attrs == (system(axes).attrs if axes else {}), name
     wrong = {
         "two.tps": "one specimen needed, found x, y: choose one as FILE.tps:x",
-        "a.tps": "2 points of 3 coordinates needed, found 1",
-        "a.pts": "3 points of 3 coordinates needed, found 2",
+        "a.tps": "2 points needed, found 1",
+        "a.pts": "3 points needed, found 2",
         "lps.fcsv": "found 'XYZ'",
     }
     (tmp_path / "a.tps").write_text("LM=2\n1 2\nID=x\n")
