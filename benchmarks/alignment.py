@@ -300,9 +300,9 @@ def femurs(n_coarse=1000):
     say("mean", "", "", *(f"{value:.2f} mm" for value in np.mean(errors, axis=0)))
 
 
-def modes():
+def modes(n=12, n_vertices=2500):
     """Print |correlation| of scores and simulated scores of the brains, and displacement errors."""
-    tree = s4a.synthetic.brains(8, 4000, seed=0)
+    tree = s4a.synthetic.brains(n, n_vertices)
     meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     truth = tree["truth"]["true_score"].values  # (shape, mode)
     title("options", "best |correlation| of each simulated mode", "variance ratios")

@@ -29,6 +29,7 @@ from s4a.input.plausibility import flag
 from s4a.method import spectral_icp
 from s4a.method.shape import Basis, corresponding_landmarks
 from s4a.options import check
+from s4a.schema import POSE
 
 N_VOTERS = 6
 # of sqrt(area): poses fit alike if the root of the difference of their squared residuals is below
@@ -59,7 +60,7 @@ class Alignment(NamedTuple):
             return ""
         best, second, *_ = self.fits
         number, angle = len(self.fits), self.angle
-        return flag("pose", number=number, best=best, second=second, angle=angle).words
+        return flag(POSE, number=number, best=best, second=second, angle=angle).words
 
 
 def less_confident(registration: xr.Dataset, n_poses: int) -> xr.Dataset:

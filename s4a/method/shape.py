@@ -413,6 +413,7 @@ def projection_operator(coarse: xr.Dataset) -> sp.csr_matrix:
     >>> U.shape, (U @ coarse["eigenfunction"].values).shape
     ((200, 95), (200, 10))
     """
+    require(coarse, what="low-resolution mesh")
     if "local_weight" in coarse:
         entries = (coarse[f"local_{part}"].values for part in ("weight", "vertex", "sample"))
         weight, row, column = entries

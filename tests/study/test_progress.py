@@ -94,8 +94,9 @@ def test_a_run_without_process_is_stopped_and_one_of_another_machine_elsewhere(n
     assert cli.main(["status", str(folder)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("on node-17, ")
-    assert lines[-2] == "left out: a: x"
-    assert len(lines[-1]) < 130
+    assert "left out: a: x" in lines
+    assert " ".join(lines).count("y") > 98  # a sentence is not cut
+    assert max(map(len, lines)) < 130
 
 
 @pytest.mark.parametrize(
