@@ -347,11 +347,11 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
         single = [name for name, count in Counter(curve).items() if name and count < 2]
         if single:
             raise ValueError(f"a curve needs at least two points; {single[0]!r} has one")
-        names = short([str(name) or str(i + 1) for i, name in enumerate(names)])
-        curve = short([str(name) for name in curve])
-    data = {"landmark_name": np.array(names), "landmark_position": points}
-    if any(curve):
-        data |= {"landmark_curve": np.array(curve), "landmark_closed": np.array(closed, bool)}
+        texts = short([str(name) or str(i + 1) for i, name in enumerate(names)])
+        curves = short([str(name) for name in curve])
+    data = {"landmark_name": np.array(texts), "landmark_position": points}
+    if any(curves):
+        data |= {"landmark_curve": np.array(curves), "landmark_closed": np.array(closed, bool)}
     return dataset(system.attrs, **data)
 
 
