@@ -14,6 +14,7 @@ import xarray as xr
 from scipy.spatial import cKDTree
 
 from s4a.geometry.align import (
+    DISTINCT,
     N_POSES,
     ROUGH,
     RigidTransform,
@@ -165,16 +166,23 @@ def _after(first: RigidTransform, second: RigidTransform) -> RigidTransform:
 
 def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Alignment:
     """Choose the pose with the least mean squared residual to the voters."""
-    rows = []
+    rows, rotations = [], []
     for other, onto in voters.values():
         starts = [relative_transform(pose, onto) for pose in found]
         ends = icp_each(source.cloud, other.cloud, starts, tolerance=5 * ROUGH)
         rows.append([residual**2 for *_, residual in ends])
+        rotations.append([R for R, *_ in ends])
     squared = np.array(rows)  # (voters, poses)
     order = np.argsort(squared.mean(0), kind="stable")
     squared, (R, t) = squared[:, order], found[order[0]]
     limit = ALIKE**2 * min(1.0, len(source.X) / ENOUGH)
-    alike = np.quantile(squared - squared[:, :1], 0.25, axis=0) < limit
+    turned = np.array(rotations)[:, order]  # (voters, poses, 3, 3)
+    # the trace of a rotation is 1 + 2 cos(angle)
+    cosines = (np.einsum("vpij,vij->vp", turned, turned[:, 0]) - 1) / 2
+    difference = squared - squared[:, :1]
+    # a pose from which ICP ends at the best one is none of its own
+    difference[:, 1:][cosines[:, 1:] > np.cos(np.deg2rad(DISTINCT))] = 1.0
+    alike = np.quantile(difference, 0.25, axis=0) < limit
     fits = tuple(np.sqrt(squared.mean(0)[alike]).tolist())
     if len(fits) < 2 or _differs(source, voters, (R, t)):
         return Alignment(R, t, fits[:1])
