@@ -1,6 +1,7 @@
 """Export of registered collections to other programs (4.3, 6.1, 6.2): meshes and tables."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,14 @@ from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_rows
 from s4a.input.chirality import map_to_file
-from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved, turned
+from s4a.input.coordinates import (
+    UNKNOWN,
+    CoordinateSystem,
+    file_system,
+    map_between,
+    moved,
+    turned,
+)
 from s4a.input.files import write_mesh
 from s4a.study import store
 
@@ -114,10 +122,10 @@ def write_registered(
     folder.mkdir(parents=True, exist_ok=True)
     suffix = FORMATS[format]
     X, T = as_arrays(registration)
-    paths, system = [], CoordinateSystem()
+    paths, aligned = [], system_of_template(study, registration.attrs.get("template", ""))
     for name in names:
         registered = registration.sel(shape=name)
-        points, triangles = X + registered["displacement"].values, T
+        points, triangles, system = X + registered["displacement"].values, T, aligned
         if frame == "shape":
             M, system = map_to_scan(study, name)
             points = moved(image_in_shape(X, registered), M)
@@ -129,10 +137,17 @@ def write_registered(
         paths.append(folder / f"{name}{suffix}")
         write_mesh(paths[-1], points, triangles, **system.attrs, **scalars)
     paths.append(folder / f"template{suffix}")
-    write_mesh(paths[-1], X, T)
+    write_mesh(paths[-1], X, T, **aligned.attrs)
     return paths + (
         _write_modes(study["pca"].to_dataset(), folder, n_modes) if "pca" in study else []
     )
+
+
+def system_of_template(study: xr.DataTree, name: str) -> CoordinateSystem:
+    """Return the axes and unit of shapes that are aligned to the template, without c_ras."""
+    meshes = study["original"].children if "original" in study.children else {}
+    system = CoordinateSystem.of(meshes[name].attrs if name in meshes else {})
+    return replace(system, origin=UNKNOWN if system.axes else "", to_scanner=None)
 
 
 def map_to_scan(

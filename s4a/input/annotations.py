@@ -401,7 +401,12 @@ def _scalismo_points(text):
 
 def _slicer_points(text):
     lists = json.loads(text)["markups"]
-    systems = {str(m.get("coordinateSystem", "LPS")).upper() for m in lists}
+    axes = "coordinateSystem"  # of a list, or of a point
+    systems = {
+        str(p.get(axes, m.get(axes, "LPS"))).upper()
+        for m in lists
+        for p in (m, *(m.get("controlPoints") or []))
+    }
     if len(systems) != 1 or not systems <= {"LPS", "RAS"}:
         names = ", ".join(sorted(systems)) or "no markups"
         raise ValueError(f"one coordinateSystem, LPS or RAS, needed, found {names}")

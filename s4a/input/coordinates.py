@@ -344,7 +344,9 @@ def _of_volume(x, y, z, c):
 def _of_gifti(data):
     """RAS in mm; the space of the points, their map to scanner RAS, or FreeSurfer's VolGeom."""
     root, maps = xml(data), {}
-    for node in root.iter("CoordinateSystemTransformMatrix"):
+    points = root.find("DataArray[@Intent='NIFTI_INTENT_POINTSET']")
+    points = root if points is None else points
+    for node in points.iter("CoordinateSystemTransformMatrix"):
         texts = [node.findtext(tag) or "" for tag in ("DataSpace", "TransformedSpace")]
         here, there = (SPACES.get(t.strip().removeprefix("NIFTI_XFORM_"), 0) for t in texts)
         if here:

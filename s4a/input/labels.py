@@ -9,23 +9,24 @@ import math
 import os
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy import sparse
 
 from s4a.geometry.mesh import directed_edges
-from s4a.input.coordinates import AXES, CoordinateSystem, map_to_ras, nifti_system
+from s4a.input.coordinates import AXES, UNKNOWN, CoordinateSystem, map_to_ras, nifti_system
 from s4a.input.formats import PLY_TYPES
 from s4a.input.raw import check_there, content, gunzip, reading
-from s4a.options import check_label
+from s4a.options import MILLIMETRES, check_label
 
 VOLUMES = {".nii": "NIfTI", ".mgz": "MGH", ".mgh": "MGH", ".nrrd": "NRRD"}
 Label = int | str | Iterable[int] | None
 ITERATIONS = 20  # of smoothing
 _UNPACKED = 2**29  # unpacked bytes that are always accepted: labels compress well
 SHRINK, GROW = 0.5, -0.51  # steps of an iteration: lambda and mu of Taubin
-MILLIMETRES = {"mm": 1.0, "unknown": 1.0, "meter": 1000.0, "micron": 0.001}
+_UNITS = {"unknown": "mm", "meter": "m", "micron": "um"}  # of NIfTI
 _MOST_REPORTED = 30  # labels that an error lists
 _ROUNDED = 1e-3  # largest distance of a label from a whole number
 
@@ -114,6 +115,8 @@ def grid_of(data: bytes) -> tuple[tuple[int, ...], np.ndarray, CoordinateSystem]
     affine, is_oriented = _affine_of(header, name)
     codes = [0, 2] if name == "MGH" else [int(header[f"{form}form_code"]) for form in "qs"]
     system = nifti_system(codes[1] or codes[0]) if is_oriented else CoordinateSystem(unit="mm")
+    if name == "MGH" and data[28:30] == b"\0\0":  # goodRASFlag: nibabel makes up directions
+        system = replace(system, origin=UNKNOWN)
     return _shape_of(header), affine, system
 
 
@@ -137,8 +140,10 @@ def _whole(values):
     """Labels as integers, and a note if they were rounded; ValueError for other values."""
     if values.dtype.kind in "iub":
         return values, ""
+    if values.dtype.kind != "f":
+        raise ValueError(f"integers expected, found {values.dtype}: this is not a label volume")
     with np.errstate(all="ignore"):
-        labels = np.round(values) if values.dtype.kind == "f" else values
+        labels = np.round(values)
         rest = np.abs(labels - values)
         if not ((rest <= _ROUNDED) & (np.abs(labels) < 2**53)).all():
             wrong = values[~(rest <= _ROUNDED)].ravel()[:1]
@@ -174,8 +179,9 @@ def _as_nifti(data):
     end = re.search(rb"\r?\n\r?\n", data)
     head = data[: end.start() if end else len(data)].decode("latin-1")
     fields = dict(re.findall(r"^([\w ]+):[ \t]*(.*?)\s*$", head, re.M))
-    missing = [name for name in ("type", "sizes", "encoding") if name not in fields]
-    if not end or missing or {"data file", "datafile"} & set(fields):
+    missing = {"type", "sizes", "encoding"} - {*fields}
+    skips = "data file|datafile|(byte|line) ?skip"  # voxels elsewhere
+    if not end or missing or any(re.fullmatch(skips, n) and v != "0" for n, v in fields.items()):
         raise ValueError(
             "a header with type, sizes and encoding, and voxels in the same file, expected; save "
             "it as one .nrrd file"
@@ -190,7 +196,7 @@ def _as_nifti(data):
         )
     body = data[end.end() :]
     body = body if fields["encoding"] == "raw" else gunzip(io.BytesIO(body), _UNPACKED)
-    dtype = np.dtype((">" if fields.get("endian") == "big" else "<") + PLY_TYPES[kind])
+    dtype = np.dtype((">" if fields.get("endian", "").lower() == "big" else "<") + PLY_TYPES[kind])
     needed = math.prod(sizes) * dtype.itemsize
     if min(sizes) < 1 or needed > len(body):
         raise ValueError(f"{needed} bytes of voxels {sizes} expected, found {len(body)}")
@@ -198,16 +204,20 @@ def _as_nifti(data):
     image = nibabel.Nifti1Image(values, None, dtype=values.dtype)
     image.header.set_xyzt_units("mm")
     found = re.findall(r"\(([^()]*)\)", fields.get("space directions", ""))
-    axes = np.array([axis.split(",") for axis in found], float)
+    units = {*re.findall('"(.*?)"', fields.get("space units") or fields.get("units") or '"mm"')}
+    if len(units) != 1 or not units <= {*MILLIMETRES}:
+        raise ValueError(f"one unit of {', '.join(MILLIMETRES)} expected, found {sorted(units)}")
+    scale = MILLIMETRES[units.pop()]
+    axes = scale * np.array([axis.split(",") for axis in found], float)
     words = fields.get("space", "").upper().split("-")  # left-posterior-superior, or LPS
     space = words[0] if len(words) == 1 else "".join(word[:1] for word in words)
     if space in AXES and axes.shape == (3, 3):
         origin = fields.get("space origin", "(0,0,0)").strip("()").split(",")
-        to_space = np.vstack([np.c_[axes.T, np.array(origin, float)], [0, 0, 0, 1]])
+        to_space = np.vstack([np.c_[axes.T, scale * np.array(origin, float)], [0, 0, 0, 1]])
         to_ras = map_to_ras(CoordinateSystem(space), placed=False)
         image.set_sform(to_ras @ to_space, code="aligned")
     else:
-        spacings = np.array(fields.get("spacings", "1 1 1").split(), float)
+        spacings = scale * np.array(fields.get("spacings", "1 1 1").split(), float)
         image.header.set_zooms(np.linalg.norm(axes, axis=1) if len(axes) else spacings)
     return image.to_bytes()
 
@@ -229,7 +239,8 @@ def _affine_of(header, name):
         raise ValueError("an invertible affine map to millimetres needed")
     if name == "MGH":
         return affine, True
-    affine[:3] *= MILLIMETRES[header.get_xyzt_units()[0]]
+    unit = header.get_xyzt_units()[0]
+    affine[:3] *= MILLIMETRES[_UNITS.get(unit, unit)]
     return affine, int(header["sform_code"]) != 0 or int(header["qform_code"]) != 0
 
 

@@ -84,6 +84,13 @@ def locate(
     better = [name for name in far if far[given] > limit / 3 and far[name] < far[given] / 2]
     best = min(better, key=lambda name: far[name], default=given)
     surface_point, position, distance = found[best]
+    others = [
+        name
+        for name in found
+        if name.startswith("a mesh")
+        and far[name] < limit
+        and np.abs(found[name][1] - position).max() > limit
+    ]  # of landmarks from 3D Slicer on a mesh that fits in two directions
     is_guess = best not in (KNOWN, GIVEN)
     limit = limit / 3 if is_guess else limit  # a guess needs more evidence
     if distance.max() > limit:
@@ -97,12 +104,13 @@ def locate(
             f"{CoordinateSystem.of(landmarks.attrs)}; mesh: {CoordinateSystem.of(mesh.attrs)}; "
             "coordinate_system= and unit= say what a file does not"
         )
-    if is_guess:
+    if is_guess or others:
         log.warning(
             "the coordinate system of the landmarks or of the mesh is unknown: %s fits, with at "
-            "most %.3g from the surface; coordinate_system= says it",
+            "most %.3g from the surface%s; coordinate_system= says it",
             best,
             distance.max(),
+            "".join(f", and {name} with {far[name]:.3g}" for name in others),
         )
     return _located(
         surface_point,

@@ -20,7 +20,10 @@ def test_every_shape_is_written_with_the_triangles_of_the_template(study, tmp_pa
     paths = write_registered(study, tmp_path, format=format)
     data = study["registration"].to_dataset()
     for name in [*data["shape"].values, "template"]:
-        points, triangles, _ = read_mesh(tmp_path / f"{name}.{suffix}")
+        points, triangles, attrs = read_mesh(tmp_path / f"{name}.{suffix}")
+        assert attrs.get("coordinate_system") == (
+            None if suffix == "npz" else "RAS, origin unknown"
+        )
         assert (triangles == data["corner_vertex"].values).all()
         moved = 0 if name == "template" else data["displacement"].sel(shape=name).values
         assert points == pytest.approx(data["position"].values + moved, abs=1e-3)

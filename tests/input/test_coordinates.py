@@ -109,6 +109,10 @@ def test_every_format_says_its_coordinate_system(tmp_path):
         assert (attrs["coordinate_system"], attrs["unit"]) == (text, "mm"), path.name
         if path.suffix != ".obj":
             assert points == pytest.approx(X, abs=1e-4), path.name
+    image = nib.load(tmp_path / "a.gii")
+    image.darrays[1].coordsys = GiftiCoordSystem(1, 1)  # of the triangles, which have none
+    nib.save(image, tmp_path / "g.gii")
+    assert read_mesh(tmp_path / "g.gii")[2]["coordinate_system"] == "RAS, origin unknown"
     with pytest.raises(ValueError, match=r"one set of points .* found 2 and 1: save each surface"):
         read_mesh(gifti(tmp_path / "two.gii", sets=2))
 
@@ -226,6 +230,16 @@ COLUMNS = "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNo
 FCSV = "n_{0},{1},{2},{3},0,0,0,1,1,1,0,{4},,\n"
 
 
+def test_landmarks_that_fit_a_mesh_in_two_directions_are_reported(caplog):
+    points = {"landmark_name": list("ab"), "landmark_position": X[[3, 40]]}
+    both = as_dataset(np.r_[X, X * [-1, -1, 1]], np.r_[T, T + len(X)])
+    locate(dataset(system("LPS").attrs, **points), both)
+    assert "and a mesh in RAS with" in caplog.text
+    caplog.clear()
+    locate(dataset(system("LPS").attrs, **points), as_dataset(X, T))
+    assert not caplog.text
+
+
 def test_landmark_files_of_other_programs_are_read(tmp_path):
     P, names = np.array([[1.5, 2, 3], [-4, 5.25, 6]]), ["a", "b"]
     rows = list(zip(range(2), *P.T.tolist(), names, strict=True))
@@ -263,6 +277,10 @@ def test_landmark_files_of_other_programs_are_read(tmp_path):
     (tmp_path / "a.tps").write_text("LM=2\n1 2\nID=x\n")
     (tmp_path / "a.pts").write_text(f"Version 1.0\n3\n{plain}")
     (tmp_path / "lps.fcsv").write_text(f"# CoordinateSystem = XYZ\n{COLUMNS}{fcsv}")
+    markups = '{"markups": [{"coordinateSystem": "LPS", "controlPoints": [%s]}]}'
+    point = '{"position": [1, 2, 3], "coordinateSystem": "RAS"}'
+    (tmp_path / "a.mrk.json").write_text(markups % point)
+    wrong["a.mrk.json"] = "one coordinateSystem, LPS or RAS, needed, found LPS, RAS"
     for name, words in wrong.items():
         with pytest.raises(ValueError, match=words):
             read_landmarks(tmp_path / name)

@@ -178,8 +178,16 @@ def test_other_files_of_the_same_volume_give_the_same_surface(tmp_path):
         np.testing.assert_array_equal(S, T)
         assert attrs["coordinate_system"] == "RAS"
         assert ("were rounded" in attrs.get("note", "")) == (name == "scaled.nii.gz")
+    small = AFFINE * np.array([[0.1], [0.1], [0.1], [1]])
+    changed = {"space units": '"cm" "cm" "cm"', "byte skip": "0", "endian": "Big"}
+    Y = read_volume(nrrd(tmp_path / "cm.nrrd", values, small, **changed), 17)[0]
+    np.testing.assert_allclose(Y, X, atol=1e-4)
     _, _, attrs = read_volume(nrrd(tmp_path / "b.nrrd", values, AFFINE, space=None), 17)
     assert "no orientation" in attrs["note"]
+    nibabel.save(nibabel.MGHImage(values, AFFINE), tmp_path / "a.mgh")
+    data = (tmp_path / "a.mgh").read_bytes()
+    (tmp_path / "a.mgh").write_bytes(data[:28] + b"\0\0" + data[30:])  # goodRASFlag
+    assert read_volume(tmp_path / "a.mgh", 17)[2]["coordinate_system"] == "RAS, origin unknown"
 
 
 @pytest.mark.parametrize(
@@ -189,6 +197,8 @@ def test_other_files_of_the_same_volume_give_the_same_surface(tmp_path):
         ({"sizes": "30 30 300"}, "bytes of voxels"),
         ({"type": "block"}, "numbers, .*, found block"),
         ({"data file": "a.raw"}, "voxels in the same file, expected"),
+        ({"byte skip": "-1"}, "voxels in the same file, expected"),
+        ({"space units": '"furlong"'}, "one unit of um, mm, .*found .*furlong"),
         ({"encoding": "bzip2"}, "raw or gzip, .*, found .*bzip2"),
     ],
 )
