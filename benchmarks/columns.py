@@ -1,6 +1,6 @@
 """Check of the columns of a table: findings in simulated columns, clean and with one wrong value.
 
-``python benchmarks/columns.py`` prints the table of docs/plausibility.md, in a minute.
+``python benchmarks/columns.py`` prints the table of docs/plausibility.md, in half a minute.
 """
 
 import logging

@@ -23,6 +23,8 @@ from s4a.input.raw import check_there, content, npy, npz, reading, shown, text_o
 from s4a.options import MILLIMETRES
 from s4a.schema import dataset, require, unit_of
 
+log = logging.getLogger(__name__)
+
 LONGEST = 255  # characters of a name, as NumPy pads each text to the longest
 _MARKUPS = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/"
@@ -58,7 +60,7 @@ def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
     file = Path(f"{before}.npz" if name else before)
     check_there(file)
     kind = Path(file.name.lower().removesuffix(".gz")).suffix
-    readers = {".npy": npy, ".gii": _gifti_labels, ".annot": _annot_labels}
+    readers = {".npy": npy, ".gii": _gifti_vector, ".annot": _annot_labels}
     with reading(path, "labels"):
         data = content(file)
         if kind == ".npz" or zipfile.is_zipfile(io.BytesIO(data)):
@@ -104,13 +106,14 @@ def _npz_labels(data, file, name, n):
     return columns[fitting[0]]
 
 
-def _gifti_labels(data):
+def _gifti_vector(data, intent="LABEL"):
+    """The array of labels, if there is one, or of one dimension."""
     arrays = gifti_arrays(data)
-    labels = [values for intent, values in arrays if intent == "LABEL"]
-    labels = labels or [values for _, values in arrays if values.ndim == 1]
-    if not labels:
-        raise ValueError("a GIFTI array of labels needed, found none")
-    return labels[0]
+    found = [values for of, values in arrays if of == intent]
+    found = found or [values for _, values in arrays if values.ndim == 1]
+    if not found:
+        raise ValueError("a GIFTI array of one dimension needed, found none")
+    return found[0]
 
 
 class _Cursor:
@@ -142,8 +145,7 @@ def _annot_labels(data):
     """
     file = _Cursor(data)
     vertex, annotation = file.numbers(2 * file.number()).reshape(-1, 2).T
-    if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
-        raise ValueError(f"every vertex from 0 to {len(vertex) - 1} expected once")
+    _check_vertices(vertex)
     if not file.number():
         raise ValueError("a colour table expected, found none")
     row_of_colour = _colour_table(file)
@@ -280,38 +282,23 @@ def _text_labels(data):
 
 def _cells(rows, at, has_head):
     """Cells of a column by line, in the order of the column ``vertex`` if there is one."""
-    n, order, head = len(next(iter(rows.values()))), None, []
-    if has_head:
-        head = [cell.lower() for cell in rows.pop(next(iter(rows)))]
-        order = _order_of_vertices(head, rows) if n > 1 else None
+    n = len(next(iter(rows.values())))
+    head = [cell.lower() for cell in rows.pop(next(iter(rows)))] if has_head else []
     _check_cells(rows, n, 1 + at)
     lines = list(rows)
-    return {lines[i]: rows[lines[i]][at] for i in (range(len(lines)) if order is None else order)}
+    if n > 1 and "vertex" in head:
+        column = head.index("vertex")
+        _check_cells(rows, n, 1 + column)
+        vertex = np.array([_number_of(row[column], line) for line, row in rows.items()])
+        _check_vertices(vertex)
+        lines = [lines[i] for i in np.argsort(vertex)]
+    return {line: rows[line][at] for line in lines}
 
 
-def _order_of_vertices(head, rows):
-    """Order of the rows of a table by its column ``vertex``; None if there is no such column.
-
-    Parameters
-    ----------
-    head : list of str
-        Names of the columns, in lower case.
-    rows : dict of int to list of str
-        Cells of each row, by line in the file.
-
-    Raises
-    ------
-    ValueError
-        If the column does not have every index from 0 once.
-    """
-    if "vertex" not in head:
-        return None
-    at = head.index("vertex")
-    _check_cells(rows, len(head), 1 + at)
-    vertex = np.array([_number_of(row[at], line) for line, row in rows.items()])
+def _check_vertices(vertex):
+    """Raise ValueError unless every vertex is there once."""
     if not np.array_equal(np.sort(vertex), np.arange(len(vertex))):
-        raise ValueError(f"the column 'vertex' needs every index from 0 to {len(vertex) - 1} once")
-    return np.argsort(vertex)
+        raise ValueError(f"every vertex from 0 to {len(vertex) - 1} needed once")
 
 
 def read_landmarks(path: Path | str) -> xr.Dataset:
@@ -348,18 +335,23 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
             text, reader = _specimen(text, specimen), _tps_points
         elif re.match(r"\s*version\b", text, re.I):
             reader = _pts_points
-        names, points, system, curve, closed = (reader or _table_points)(text)
-        points = np.array(points, float).reshape(-1, 3)
-        if len(points) == 0 or not np.isfinite(points).all():
-            raise ValueError(f"points with finite coordinates needed, found {len(points)}")
+        system, rows = (reader or _table_points)(text)
+        sizes = {len(position) for _, position, *_ in rows}
+        if sizes != {3}:
+            raise ValueError(f"points of 3 coordinates needed, found {len(rows)} of {sizes or 0}")
+        # name, position, curve, closed
+        names, positions, curve, closed = zip(*((*row, "", False)[:4] for row in rows), strict=True)
+        points = np.array(positions, float)
+        if not np.isfinite(points).all():
+            raise ValueError("points with finite coordinates needed")
         single = [name for name, count in Counter(curve).items() if name and count < 2]
         if single:
             raise ValueError(f"a curve needs at least two points; {single[0]!r} has one")
-        names = short([str(name) or str(i + 1) for i, name in enumerate(names)])
-        curve = short([str(name) for name in curve])
-    data = {"landmark_name": np.array(names), "landmark_position": points}
-    if any(curve):
-        data |= {"landmark_curve": np.array(curve), "landmark_closed": np.array(closed, bool)}
+        texts = short([str(name) or str(i + 1) for i, name in enumerate(names)])
+        curves = short([str(name) for name in curve])
+    data = {"landmark_name": np.array(texts), "landmark_position": points}
+    if any(curves):
+        data |= {"landmark_curve": np.array(curves), "landmark_closed": np.array(closed, bool)}
     return dataset(system.attrs, **data)
 
 
@@ -385,30 +377,26 @@ def _tps_points(text):
     others = [line for line in lines[n:] if not re.match(r"(?i)(ID|IMAGE|SCALE|COMMENT)\s*=", line)]
     if others:
         raise ValueError(f"{n} points and their ID needed, found the line {others[0][:40]!r}")
-    return _numbered(points, n, float(scale[1]) if scale else 1.0)
+    factor = float(scale[1]) if scale else 1.0
+    return CoordinateSystem(), _counted([("", factor * np.array(p, float)) for p in points], n)
 
 
 def _pts_points(text):
     """Points of IDAV's Landmark editor, or of other files that begin with a version."""
     head, *lines = [line.strip() for line in text.splitlines()[1:] if line.strip(" \t{}")]
     rows = [line.split() for line in lines]
-    names = [row.pop(0) if len(row) == 4 else "" for row in rows]
-    return names, *_numbered(rows, int(head.split()[-1]))[1:]
+    rows = [(row[0], row[1:]) if len(row) == 4 else ("", row) for row in rows]
+    return CoordinateSystem(), _counted(rows, int(head.split()[-1]))
 
 
-def _numbered(points, n, scale=1.0):
-    """Landmarks of unknown names and coordinate system; ValueError unless n points in 3D."""
-    if len(points) != n or any(len(point) != 3 for point in points):
-        found = {len(point) for point in points}
-        raise ValueError(f"{n} points of 3 coordinates needed, found {len(points)} of {found}")
-    points = scale * np.array(points, float).reshape(-1, 3)
-    return [""] * n, points, CoordinateSystem(), [""] * n, []
+def _counted(rows, n):
+    if len(rows) != n:
+        raise ValueError(f"{n} points needed, found {len(rows)}")
+    return rows
 
 
 def _scalismo_points(text):
-    marks = json.loads(text)
-    points = [mark["coordinates"] for mark in marks]
-    return [mark["id"] for mark in marks], *_numbered(points, len(points))[1:]
+    return CoordinateSystem(), [(mark["id"], mark["coordinates"]) for mark in json.loads(text)]
 
 
 def _slicer_points(text):
@@ -435,19 +423,16 @@ def _slicer_points(text):
             (p.get("label", ""), p["position"], curve, m.get("type") == "ClosedCurve")
             for p in points
         ]
-    labels, positions, curves, closed = zip(*rows, strict=True) if rows else ((),) * 4
     units = {u for m in lists for u in np.ravel(m.get("coordinateUnits") or "mm").tolist()}
     if len(units) != 1 or not units <= {*MILLIMETRES}:
         raise ValueError(f"one of {', '.join(MILLIMETRES)} as unit needed, found {sorted(units)}")
-    system = CoordinateSystem(systems.pop(), "", units.pop())
-    return labels, positions, system, curves, closed
+    return CoordinateSystem(systems.pop(), "", units.pop()), rows
 
 
 def _meshlab_points(text):
     points = [p for p in xml(text).iter("point") if p.get("active") != "0"]
-    names = [p.get("name", "") for p in points]
-    positions = [[p.get(axis) for axis in "xyz"] for p in points]
-    return names, positions, CoordinateSystem(), [""] * len(names), []
+    rows = [(p.get("name", ""), [p.get(axis) for axis in "xyz"]) for p in points]
+    return CoordinateSystem(), rows
 
 
 def _table_points(text):
@@ -479,16 +464,12 @@ def _table_points(text):
         raise ValueError(f"the columns name, x, y and z needed, found {', '.join(header)}")
     used = [i for i in (*x, name, curve, closed) if i is not None]
     _check_cells(rows, len(head), 1 + max(used))
-    names, curves, is_closed = (
-        ["" if i is None else row[i] for row in rows.values()] for i in (name, curve, closed)
-    )
-    return (
-        names,
-        [[_number_of(row[i], line) for i in x] for line, row in rows.items()],
-        system,
-        curves,
-        [c.lower() in ("1", "true", "yes") for c in is_closed],
-    )
+    points = []
+    for line, row in rows.items():
+        label, of_curve, is_closed = ("" if i is None else row[i] for i in (name, curve, closed))
+        position = [_number_of(row[i], line) for i in x]
+        points.append((label, position, of_curve, is_closed.lower() in ("1", "true", "yes")))
+    return system, points
 
 
 def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
@@ -606,8 +587,6 @@ def labels_of_file(
     vertex = np.where(previous >= 0, vertex[previous], 0)
     return np.asarray(labels)[vertex], int(dropped.sum())
 
-
-log = logging.getLogger(__name__)
 
 _CURV = b"\xff\xff\xff"  # first bytes of FreeSurfer's curvature files
 SUFFIXES = (".npy", ".npz", ".ply", ".csv", ".txt", ".gii")
@@ -824,10 +803,7 @@ def _values(data, file, name):
     if file.endswith(".npy"):
         return npy(data)
     if file.endswith(".gii"):
-        vectors = [values for _, values in gifti_arrays(data) if values.ndim == 1]
-        if not vectors:
-            raise ValueError("a GIFTI array of one dimension expected, found none")
-        return vectors[0]
+        return _gifti_vector(data, intent=None)
     return _column(text_of(data), name)
 
 

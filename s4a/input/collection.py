@@ -241,7 +241,7 @@ def read_labels(paths: Paths, *, label: Label = "all", **options: Any) -> xr.Dat
     Parameters
     ----------
     paths : str, Path or list of these
-        Folders, globs or files: NIfTI (.nii) or FreeSurfer (.mgh, .mgz), each also as .gz.
+        Folders, globs or files: NIfTI (.nii), FreeSurfer (.mgh, .mgz) or NRRD (.nrrd), also as .gz.
     label : int, str or list of int
         The structure; several labels (``[1, 2]`` or ``"1,2"``) are merged, ``"all"`` means every
         voxel that is not 0.

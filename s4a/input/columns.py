@@ -17,14 +17,9 @@ from s4a.input.subjects import is_plain_number, listed
 log = logging.getLogger(__name__)
 
 # -9, 99, -999, 9998 and alike, and the largest integers of 16 and 32 bits
-_CODES = {-1.0, *(float(s + n + d) for s in ("", "-") for d in "789" for n in ("", "9", "99"))}
-_CODES |= {float(s + d * n) for s in ("", "-") for d in "789" for n in range(2, 7)}
-_CODES |= {float(s + n) for s in ("", "-") for n in ("9998", "9997", "32768", "2147483648")}
-_CODES |= {32767.0, 65535.0, 2147483647.0}
+_CODES = re.compile(r"-1|-?(9*[789]|77+|88+|32768|2147483648)|32767|65535|2147483647")
 _WORDS = re.compile(r"[?.]+|unknown|missing|not available|n\.a\.|n\.?d\.?|#.*[!?]", re.IGNORECASE)
-# level of an outlier in a column; of a usual code; of a value ten times the others
-_LEVEL, _CODE_LEVEL, _SLIP_LEVEL = 3e-4, 0.01, 0.04
-_POWERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the Box-Cox transformation
+_LEVEL, _SLIP_LEVEL = 3e-4, 0.04  # of an outlier in a column; of a value ten times the others
 # Cyrillic and Greek letters and dashes that look like Latin letters and the hyphen
 _SAME = str.maketrans(
     "аеорсухіѕјкмнтвΑΒΕΖΗΙΚΜΝΟΡΤΥΧαοινρυχ‐‑‒–—−", "aeopcyxisjkmhtbABEZHIKMNOPTYXaoivpux------"
@@ -72,9 +67,9 @@ is a value, give the column in another unit
 
 def _check_names(cells, names, what):
     """Check names of groups or subjects."""
-    numbers = np.array([float(c) if is_plain_number(c) else np.nan for c in cells])
+    numbers = [float(cell) if is_plain_number(cell) else np.nan for cell in cells]
     is_mixed = np.isnan(numbers).any()
-    codes = np.isin(numbers, list(_CODES)) if is_mixed else missing_codes(numbers)
+    codes = _usual(numbers) if is_mixed else missing_codes(np.array(numbers))
     codes |= [bool(_WORDS.fullmatch(cell)) for cell in cells]
     _report_codes(codes, cells, names, what, "the others are names" if is_mixed else "")
     for same, variants in look_alikes(cells):
@@ -138,10 +133,9 @@ def missing_codes(x: np.ndarray) -> np.ndarray:
     >>> missing_codes(np.array([-9, -4, 7, 12.0])).any()
     np.False_
     """
-    possible = np.isin(x, list(_CODES))
-    found = np.zeros(len(x), bool)
+    possible, found = _usual(x), np.zeros(len(x), bool)
     for code in np.unique(x[possible]):
-        # of one digit, values may be codes of the other sign, or -1
+        # -1 and one digit of the other sign may be values
         digit = (abs(x) < 10) & ((x * code < 0) | (x == -1)) & (x != code)
         rest = x[~possible | digit]
         if len(np.unique(rest)) > 1:
@@ -149,33 +143,34 @@ def missing_codes(x: np.ndarray) -> np.ndarray:
     return found
 
 
+def _usual(x):
+    """Mask of the numbers that are usual codes."""
+    return np.array([bool(_CODES.fullmatch(f"{value:.15g}")) for value in x])
+
+
 def _is_code(code, rest, count):
-    """Whether a usual code is one among the other values of its column."""
-    n, decimals, extent = len(rest) + 1, (rest % 1 != 0).mean(), np.ptp(rest)
-    level, levels = n * _p_value(code, rest), len(np.unique(rest))
-    if 2 * levels < n and rest.min() >= 0 and abs(code) > 2 * rest.max():
-        return True  # one of few levels
-    if code < 0 <= rest.min():
-        zero_is_far = rest.min() >= max(5, abs(code)) or level < _CODE_LEVEL
-        return code < -10 or zero_is_far or (n > 4 and code < -1 and decimals > 0.75)
-    if abs(code) > 99 and n > 5 and decimals == 1:
+    """Whether a usual code is one among the other values of its column, as it is far from them."""
+    if abs(code) < 10 and rest.min() < 0:
+        return False  # of differences
+    low, high, decimals = rest.min(), rest.max(), (rest % 1 != 0).mean()
+    gap = low - code if code < 0 else code - high
+    extent = (high - low) * (1 + 4 / len(rest))  # the extent of few values is uncertain
+    if code < 0 <= low:
+        is_far = low >= max(5, -code) or gap > max(3, 2 * extent)
+        return code < -10 or is_far or (len(rest) > 3 and code < -1 and decimals > 0.75)
+    if abs(code) > 99 and len(rest) > 4 and decimals == 1:
         return True  # the only integer
-    if 0 < code < 10 and rest.min() < 0:
-        return False
-    if code > 5 * rest.max() > 0 and code > 8:
-        return True
-    gap = rest.min() - code if code < 0 else code - rest.max()
-    if count > 1 and gap > max(np.diff(np.unique(rest)).max(), extent / 4, 3):
-        return True
-    return gap > max(extent, 3) and level < _CODE_LEVEL
+    if count > 1:
+        extent = max(np.diff(np.unique(rest)).max(), (high - low) / 4)
+    return bool(gap > max(3, extent))
 
 
 def outlying(x: np.ndarray) -> np.ndarray:
     """Return a mask of outliers of numbers ``(n,)``, in a column of any skewness.
 
-    The others are brought to a normal distribution by a power (Box and Cox 1964), and a value is
-    compared with them by the t distribution of a new observation.  A value that is 10, 100 or 1000
-    times one in their range, as 290 for 29, needs less evidence.
+    A value is compared with the others, and positive ones by their logarithms too, by the t
+    distribution of a new observation.  A value that is 10, 100 or 1000 times one in their range, as
+    290 for 29, needs less evidence.
 
     Examples
     --------
@@ -207,34 +202,21 @@ def _is_outlying(value, rest, n):
 
 
 def _p_value(value, rest):
-    """Return the p value of a new observation among others ``(m,)``, after a transformation."""
-    step = np.diff(np.unique(rest)).min(initial=np.inf)
+    """Return the p value of a new observation among others ``(m,)``, or of the logarithms."""
+    step = np.diff(np.unique(rest)).min(initial=np.inf)  # to which numbers are rounded
     if not np.isfinite(step):  # a constant
         return 1.0
-    scale = np.abs(rest).max()
-    value, rest, step = value / scale, rest / scale, step / scale
-    power, shift = 1.0, 0.0
-    if min(value, rest.min()) >= 0:
-        # zero has no logarithm
-        shift = rest[rest > 0].min() if min(value, rest.min()) == 0 else 0.0
-        every = np.append(rest, value) + shift
-        power = max(_POWERS, key=lambda power: _likelihood(every, power))
-    y = _transformed(rest + shift, power)
-    # numbers are rounded to steps
-    middle = np.median(rest) + shift
-    rounding = np.diff(_transformed(np.array([middle, middle + step]), power))[0]
-    deviation = np.hypot(y.std(ddof=1), rounding) * np.sqrt(1 + 1 / len(y))
-    t = (_transformed(np.array([value + shift]), power)[0] - y.mean()) / deviation
-    return 2 * stdtr(len(y) - 1, -abs(t))
+    p, least = _p_of_new(value, rest, step), min(value, rest.min())
+    if least < 0:
+        return p
+    shift = 0 if least else rest[rest > 0].min()  # zero has no logarithm
+    step = np.log1p(step / (np.median(rest) + shift))
+    return max(p, _p_of_new(np.log(value + shift), np.log(rest + shift), step))
 
 
-def _transformed(x, power):
-    return np.log(x) if power == 0 else x**power / power
-
-
-def _likelihood(x, power):
-    """Return the logarithm of the likelihood of a power (Box and Cox 1964)."""
-    return (power - 1) * np.log(x).sum() - len(x) / 2 * np.log(_transformed(x, power).var())
+def _p_of_new(value, rest, step):
+    deviation = np.hypot(rest.std(ddof=1), step) * np.sqrt(1 + 1 / len(rest))
+    return 2 * stdtr(len(rest) - 1, -abs(value - rest.mean()) / deviation)
 
 
 def look_alikes(cells: Sequence[str]) -> list[tuple[bool, list[str]]]:

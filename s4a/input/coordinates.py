@@ -258,7 +258,6 @@ def in_axes(mesh: xr.Dataset, target: CoordinateSystem, what: str = "a mesh") ->
     system = CoordinateSystem.of(mesh.attrs)
     if (system.axes, system.unit) == (target.axes, target.unit) or says_nothing(mesh):
         return mesh
-    common({what: system, "the others": target})
     new = replace(system, axes=target.axes, unit=target.unit)
     M = map_between(system, new, what)
     image = transformed(mesh, M)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from s4a.geometry.mesh import directed_edges
-from s4a.input.coordinates import UNKNOWN, CoordinateSystem, nifti_system
+from s4a.input.coordinates import AXES, UNKNOWN, CoordinateSystem, map_to_ras, nifti_system
 from s4a.input.formats import PLY_TYPES
 from s4a.input.raw import check_there, content, gunzip, reading
 from s4a.options import MILLIMETRES, check_label
@@ -29,14 +29,6 @@ SHRINK, GROW = 0.5, -0.51  # steps of an iteration: lambda and mu of Taubin
 _UNITS = {"unknown": "mm", "meter": "m", "micron": "um"}  # of NIfTI
 _MOST_REPORTED = 30  # labels that an error lists
 _ROUNDED = 1e-3  # largest distance of a label from a whole number
-_SPACES = {
-    "left-posterior-superior": (-1, -1, 1),
-    "lps": (-1, -1, 1),
-    "ras": (1, 1, 1),
-    "right-anterior-superior": (1, 1, 1),
-    "left-anterior-superior": (-1, 1, 1),
-    "las": (-1, 1, 1),
-}  # of NRRD: signs of x, y and z in RAS
 
 
 def volume_format(data: bytes) -> str:
@@ -86,10 +78,9 @@ def read_volume(
     points = points @ affine[:3, :3].T + affine[:3, 3]
     if np.linalg.det(affine[:3, :3]) < 0:
         triangles = triangles[:, ::-1]
-    attrs |= {"label": str(checked)}
-    if at_border:
-        closed = "the structure reaches the border of the volume, and was closed there"
-        attrs["note"] = "; ".join(filter(None, [attrs.get("note"), closed]))
+    closed = "the structure reaches the border of the volume, and was closed there"
+    note = "; ".join(filter(None, [attrs.pop("note"), closed * at_border]))
+    attrs |= {"label": str(checked)} | ({"note": note} if note else {})
     return smoothed(points, triangles, iterations), np.ascontiguousarray(triangles), attrs
 
 
@@ -140,15 +131,9 @@ def _volume(data):
     if needed + n_bytes > len(data):
         raise ValueError(f"{needed} bytes of voxels {shape} expected, found {len(data) - n_bytes}")
     values, rounded = _whole(np.asanyarray(kind.from_bytes(data).dataobj).reshape(shape))
-    notes = (
-        [] if system.axes else ["the volume has no orientation, left and right may be exchanged"]
-    )
-    notes += [rounded] if rounded else []
-    return (
-        values,
-        affine,
-        {"format": found, **system.attrs} | ({"note": "; ".join(notes)} if notes else {}),
-    )
+    unknown = "the volume has no orientation, left and right may be exchanged" * (not system.axes)
+    attrs = {"format": found, "note": "; ".join(filter(None, [unknown, rounded])), **system.attrs}
+    return values, affine, attrs
 
 
 def _whole(values):
@@ -224,12 +209,13 @@ def _as_nifti(data):
         raise ValueError(f"one unit of {', '.join(MILLIMETRES)} expected, found {sorted(units)}")
     scale = MILLIMETRES[units.pop()]
     axes = scale * np.array([axis.split(",") for axis in found], float)
-    signs = _SPACES.get(fields.get("space", "").lower())
-    if signs and axes.shape == (3, 3):
+    words = fields.get("space", "").upper().split("-")  # left-posterior-superior, or LPS
+    space = words[0] if len(words) == 1 else "".join(word[:1] for word in words)
+    if space in AXES and axes.shape == (3, 3):
         origin = fields.get("space origin", "(0,0,0)").strip("()").split(",")
-        affine = np.eye(4)
-        affine[:3] = np.c_[axes.T, scale * np.array(origin, float)] * np.array(signs)[:, None]
-        image.set_sform(affine, code="aligned")
+        to_space = np.vstack([np.c_[axes.T, scale * np.array(origin, float)], [0, 0, 0, 1]])
+        to_ras = map_to_ras(CoordinateSystem(space), placed=False)
+        image.set_sform(to_ras @ to_space, code="aligned")
     else:
         spacings = scale * np.array(fields.get("spacings", "1 1 1").split(), float)
         image.header.set_zooms(np.linalg.norm(axes, axis=1) if len(axes) else spacings)

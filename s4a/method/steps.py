@@ -13,12 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from s4a.geometry.align import RigidTransform, align, relative_transform
 from s4a.method import fmap, network
-from s4a.method.alignment import (
-    align_all,
-    alignment_residual,
-    pair_transform,
-    transform_onto,
-)
+from s4a.method.alignment import align_all, alignment_residual, pair_transform, transform_onto
 from s4a.method.initial_map import initial_map, map_after_alignment
 from s4a.method.latent import (
     DENSE_ITERATIONS,
@@ -153,12 +148,8 @@ def map_pairs(
         landmarks ``landmark_of_source(pair, landmark)``, ``landmark_of_target``,
         ``descriptor_energy(pair)`` and ``laplacian_energy(pair)``.
     """
-    options: dict[str, Any] = {
-        "k_init": k_init,
-        "init": init,
-        "initial_refinement": initial_refinement,
-    }
-    options["n_samples"] = n_samples
+    options: dict[str, Any] = {"k_init": k_init, "init": init, "n_samples": n_samples}
+    options["initial_refinement"] = initial_refinement
     rows: list[tuple[Any, ...]] = []
     fits: list[xr.Dataset] = []
     for a, b in pairs:
@@ -281,16 +272,9 @@ def build_network(
         name: aligned.transform for name, aligned in align_all(bases, reference, alignment).items()
     }
     pairs = [(names[i], names[j]) for i, j in network.choose_pairs(distance, n_pairs)]
-    maps = map_pairs(
-        bases,
-        transforms,
-        pairs,
-        k_init=k_init,
-        init=init,
-        initial_refinement=initial_refinement,
-        n_samples=n_samples,
-        alignment=alignment,
-    )
+    options: dict[str, Any] = {"k_init": k_init, "init": init, "n_samples": n_samples}
+    options |= {"initial_refinement": initial_refinement, "alignment": alignment}
+    maps = map_pairs(bases, transforms, pairs, **options)
     residuals = [alignment_residual(bases[n], bases[reference], transforms[n]) for n in names]
     return with_transforms(maps, transforms, reference, residuals, distance)
 

@@ -152,17 +152,9 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     k_init = min(options.k_init, k)
     aligned = align_onto(M, N, options.alignment)
     transform = aligned.transform
-    initial_refinement = options.initial_refinement == "always"
-    initial = initial_map(
-        M,
-        N,
-        transform,
-        k_init=k_init,
-        init=options.init,
-        initial_refinement=initial_refinement,
-        search=True,
-        alignment=options.alignment,
-    )
+    given: dict[str, Any] = {"k_init": k_init, "init": options.init, "alignment": options.alignment}
+    given["initial_refinement"] = options.initial_refinement == "always"
+    initial = initial_map(M, N, transform, search=True, **given)
     kept: list[tuple[np.ndarray, np.ndarray]] = []
     keep = (lambda *pair: kept.append(pair)) if options.keep_iterations else None
     C, match = fmap.zoomout(M, N, initial.C, k, step=options.step, keep=keep)

@@ -307,17 +307,10 @@ def remesh(run: Run, original: Keys, options: Options) -> Keys:
         settings = (*settings, options.method)
     if options.sampling != "normals":
         settings = (*settings, options.sampling)
-    todo = [
-        Task(
-            n,
-            f"coarse/{n}.nc",
-            remesh_shape,
-            (run.folder, n, options),
-            (key, settings),
-            names_and_keys("original", {n: key}),
-        )
-        for n, key in original.items()
-    ]
+    todo = []
+    for n, key in original.items():
+        arguments, made_from = (run.folder, n, options), names_and_keys("original", {n: key})
+        todo.append(Task(n, f"coarse/{n}.nc", remesh_shape, arguments, (key, settings), made_from))
     coarse = run.do("remesh and spectrum", todo)
     check_usable(run, coarse, options)
     return coarse
@@ -350,19 +343,18 @@ def align(run: Run, coarse: Keys, options: Options) -> tuple[Keys, tuple[str, st
     settings = (run.folder, voting, reference, options.alignment)
     task = Task("voters", "network/voters.nc", align_voters, settings, (aligned,))
     run.do("align", [task], each=False)
-    todo = [
-        Task(
-            n,
-            f"network/alignment_{n}.nc",
-            align_shape,
-            (run.folder, n, reference, options.alignment),
-            (aligned, n),
-        )
-        for n in names
-    ]
+    todo = [align_task(run, n, reference, options, (aligned, n)) for n in names]
     moved = {name: coarse[name] for name in run.do("align", todo)}
     check_usable(run, moved, options)
     return moved, (reference, coarse[reference]), aligned
+
+
+def align_task(
+    run: Run, name: str, reference: str, options: Options, inputs: tuple[str, ...]
+) -> Task:
+    """Make the task that aligns a shape to the reference."""
+    arguments = (run.folder, name, reference, options.alignment)
+    return Task(name, f"network/alignment_{name}.nc", align_shape, arguments, inputs)
 
 
 def initial_maps(run: Run, coarse: Keys, aligned: str, options: Options) -> Keys:
@@ -402,14 +394,9 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
         The key of both files.
     """
     settings = (options.k, options.step, options.n_latent, options.norm)
-    iteration_settings = (
-        options.weights,
-        options.isometric,
-        options.n_samples,
-        options.dense_iterations,
-        options.keep_iterations,
-    )
-    key = task_key(list(initial.values()), *settings, *iteration_settings)
+    of_maps = (options.weights, options.isometric, options.n_samples)
+    of_iterations = (options.dense_iterations, options.keep_iterations)
+    key = task_key(list(initial.values()), *settings, *of_maps, *of_iterations)
     old_files = list((run.folder / "iterations").glob("k_*.nc")) if options.keep_iterations else []
     files = [run.folder / "network.nc", run.folder / "latent.nc", *old_files]
     done = bool(old_files) == options.keep_iterations and all(is_done(file, key) for file in files)
@@ -422,21 +409,13 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
         tree = consistent_maps(run, list(coarse), maps, options, n_threads)
         for old in (run.folder / "iterations").glob("k_*.nc"):  # of an earlier run
             old.unlink()
-        iterations = (
-            [f"iterations/{name}" for name in tree["iterations"].children]
-            if "iterations" in tree
-            else []
-        )
+        made_from = names_and_keys("coarse", coarse)
+        iterations = [
+            node.path[1:] for node in tree.subtree if node.path.startswith("/iterations/")
+        ]
         for node in [*iterations, "network", "latent"]:
-            made_from = names_and_keys("coarse", coarse)
-            write(
-                tree[node].to_dataset(),
-                run.folder / f"{node}.nc",
-                key,
-                made_from,
-                run.claim,
-                name=node,
-            )
+            file = run.folder / f"{node}.nc"
+            write(tree[node].to_dataset(), file, key, made_from, run.claim, name=node)
     return key
 
 
@@ -450,16 +429,10 @@ def align_excluded(run: Run, excluded: Keys, reference: tuple[str, str], options
     reference : tuple (name, key)
     """
     name, reference_key = reference
-    todo = [
-        Task(
-            n,
-            f"network/alignment_{n}.nc",
-            align_shape,
-            (run.folder, n, name, options.alignment),
-            (reference_key, key, options.alignment),
-        )
-        for n, key in excluded.items()
-    ]
+    todo = []
+    for n, key in excluded.items():
+        inputs = (reference_key, key, options.alignment)
+        todo.append(align_task(run, n, name, options, inputs))
     return run.do("align flagged shapes", todo) if excluded else {}
 
 
@@ -475,17 +448,12 @@ def insert_excluded(run: Run, aligned: Keys, excluded: Keys, latent: str, option
         Keys of the alignments and of the low-resolution meshes.
     """
     settings = (options.k_init, options.of("initial maps"), options.step, options.norm)
-    todo = [
-        Task(
-            n,
-            f"latent/{n}.nc",
-            insert_shape,
-            (run.folder, n, options),
-            (latent, excluded[n], key, settings),
-            (f"latent={latent}", f"coarse/{n}={excluded[n]}"),
-        )
-        for n, key in aligned.items()
-    ]
+    todo = []
+    for n, key in aligned.items():
+        inputs = (latent, excluded[n], key, settings)
+        made_from = (f"latent={latent}", f"coarse/{n}={excluded[n]}")
+        arguments = (run.folder, n, options)
+        todo.append(Task(n, f"latent/{n}.nc", insert_shape, arguments, inputs, made_from))
     return run.do("insert flagged shapes", todo) if aligned else {}
 
 
@@ -506,20 +474,12 @@ def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Optio
         if n in run.failures:
             continue
         of_latent = {n: inserted[n]} if n in inserted else {}
-        todo.append(
-            Task(
-                n,
-                f"registration/{n}.nc",
-                register_shape,
-                (run.folder, n, template, options),
-                (template_key, key, *of_latent.values()),
-                (
-                    f"registration={template_key}",
-                    *names_and_keys("coarse", {n: key}),
-                    *names_and_keys("latent", of_latent),
-                ),
-            )
-        )
+        inputs = (template_key, key, *of_latent.values())
+        made_from = [f"registration={template_key}", *names_and_keys("coarse", {n: key})]
+        made_from += names_and_keys("latent", of_latent)
+        arguments = (run.folder, n, template, options)
+        file = f"registration/{n}.nc"
+        todo.append(Task(n, file, register_shape, arguments, inputs, tuple(made_from)))
     registered = run.do("registration", todo)
     last_template.clear()  # of this process, if it registered shapes itself
     return registered

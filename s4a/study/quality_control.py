@@ -12,14 +12,7 @@ from scipy import stats
 from scipy.spatial.distance import pdist, squareform
 
 from s4a.geometry.crossing import can_count
-from s4a.input.plausibility import (
-    Flag,
-    Flags,
-    find_warnings,
-    flag,
-    flagged_lines,
-    pick_references,
-)
+from s4a.input.plausibility import Flag, Flags, find_warnings, flag, flagged_lines, pick_references
 from s4a.options import Options
 from s4a.schema import POSE
 from s4a.study.netcdf import arrays, attributes, open_file, read
@@ -65,29 +58,17 @@ def comparisons_of(run: Run, original: Keys, options: Options) -> dict[str, xr.D
     # the method of counting is part of the key
     settings = (can_count(options.intersections),)
     counted = ("exactly",) if settings[0] else settings
-    todo = [
-        Task(
-            n,
-            f"network/descriptor_{n}.nc",
-            describe_shape,
-            (run.folder, n, *settings),
-            (key, counted),
-        )
-        for n, key in original.items()
-    ]
+    todo = []
+    for n, key in original.items():
+        file, arguments = f"network/descriptor_{n}.nc", (run.folder, n, *settings)
+        todo.append(Task(n, file, describe_shape, arguments, (key, counted)))
     descriptors = run.do("descriptor", todo)
     references = references_of(run, descriptors, options.k)
     reference_key = task_key(*(descriptors[n] for n in references))
-    todo = [
-        Task(
-            n,
-            f"network/comparison_{n}.nc",
-            compare_shape,
-            (run.folder, n, references),
-            (reference_key, key),
-        )
-        for n, key in descriptors.items()
-    ]
+    todo = []
+    for n, key in descriptors.items():
+        file, inputs = f"network/comparison_{n}.nc", (reference_key, key)
+        todo.append(Task(n, file, compare_shape, (run.folder, n, references), inputs))
     compared = run.do("compare", todo)
     return {name: comparison_of(run, name) for name in compared}
 

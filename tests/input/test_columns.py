@@ -44,6 +44,10 @@ def test_other_codes_and_outliers_are_named_with_the_values_of_the_others(caplog
     assert "9 of s3 may" in findings(with_value(9, values=[1, 2] * 6), caplog)
     assert "1750 of s3" in findings(with_value(1750, values=np.arange(12) + 165), caplog)
     assert "-9 of s3 may" in findings(with_value(-9, values=np.linspace(0.3, 17.2, 12)), caplog)
+    # the only integer, inside the range of the others
+    assert "error: it: 999 of s3" in findings(
+        with_value(999, values=np.arange(12) * 200.5 + 0.3), caplog
+    )
 
 
 def test_clean_columns_are_not_reported(caplog):
@@ -54,6 +58,7 @@ def test_clean_columns_are_not_reported(caplog):
             *(children, adults, np.where(rng.random(n) < 0.5, children.round(), adults)),
             *(rng.integers(0, 2, n), rng.random(n) < 0.1, rng.integers(1, 5, n)),
             *(rng.lognormal(8, 0.6, n), rng.normal(size=n), rng.poisson(1.5, n)),
+            rng.normal(0, 5, 20 * n).round(),
             *(rng.choice([-1, 1], n), np.arange(n), 1000 + rng.permutation(n), np.full(n, 9.0)),
             *([-999.0] * n, with_value(np.nan, values=adults)),
         ):

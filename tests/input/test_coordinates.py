@@ -191,8 +191,7 @@ def test_a_collection_is_converted_or_told_what_is_missing(tmp_path):
 
 def test_a_study_of_files_in_two_systems_is_that_of_files_in_one(tmp_path):
     brains = s4a.synthetic.brains(3, 200)["original"]
-    options = {"n_coarse": 100, "k": 10, "k_init": 6, "intersections": False,
-               "include_flagged": True}  # fmt: skip
+    options = {"n_coarse": 100, "k": 10, "k_init": 6, "quality_control": "off"}
     score, remarks = [], []
     for folder, texts in {"one": ["RAS"] * 3, "two": ["RAS", "RAS", "LPS"]}.items():
         (tmp_path / folder).mkdir()
@@ -271,8 +270,8 @@ def test_landmark_files_of_other_programs_are_read(tmp_path):
         assert found.attrs == (system(axes).attrs if axes else {}), name
     wrong = {
         "two.tps": "one specimen needed, found x, y: choose one as FILE.tps:x",
-        "a.tps": "2 points of 3 coordinates needed, found 1",
-        "a.pts": "3 points of 3 coordinates needed, found 2",
+        "a.tps": "2 points needed, found 1",
+        "a.pts": "3 points needed, found 2",
         "lps.fcsv": "found 'XYZ'",
     }
     (tmp_path / "a.tps").write_text("LM=2\n1 2\nID=x\n")
