@@ -117,6 +117,7 @@ def test_a_study_flags_ambiguous_poses_and_its_confidence_falls():
     assert set(report["status"].values) == {"flagged"}
     assert set(report["flag_kinds"].values) == {"pose"}
     assert "all are used" in report.attrs["remarks"]
+    assert "given by name" not in report.attrs["remarks"]
     assert study["pca"].sizes["shape"] == 3
     others = report["shape"].values != study["registration"].attrs["template"]
     assert study["registration"]["confidence"].values[others].max() <= 0.5
