@@ -36,6 +36,7 @@ from s4a.input.chirality import MIRROR, map_to_file
 from s4a.input.coordinates import file_system, map_between, moved
 from s4a.input.subjects import listed
 from s4a.method.pca import center_gram, gram, pca, principal_components
+from s4a.options import MILLIMETRES
 from s4a.schema import check_switch, covariate, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 from s4a.study.insert import scores_of_new
@@ -283,7 +284,11 @@ def structures(
     shapes = shared_subjects(registered)
     Y, unit = positions(study, registered, shapes)
     meshes = [as_arrays(registered[name]) for name in names]
-    areas = [vertex_areas(*mesh) for mesh in meshes]
+    lengths = [MILLIMETRES.get(unit_of(registered[n]["position"]), 1.0) for n in names]
+    areas = [  # in the unit of Y
+        vertex_areas(X * (length / MILLIMETRES.get(unit, 1.0)), T)
+        for (X, T), length in zip(meshes, lengths, strict=True)
+    ]
     report_frames(names, Y, areas)
     counts = [len(area) for area in areas]
     vertices = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])

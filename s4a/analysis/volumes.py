@@ -17,7 +17,7 @@ from s4a.input.chirality import map_to_file
 from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved, turned
 from s4a.input.labels import read_grid, voxels_marked
 
-VOLUMES = ("NIfTI", "MGH")
+VOLUMES = ("NIfTI", "MGH", "NRRD")
 
 
 def write_label_volumes(

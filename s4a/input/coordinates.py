@@ -297,7 +297,7 @@ def system_in(data: bytes, kind: str) -> CoordinateSystem:
         return CoordinateSystem("RAS", "", "mm")
     # 3D Slicer, whose unit is mm, writes SPACE into a title or comment, or into fields of VTK files
     head = data[:1000]
-    space = re.search(rb"SPACE=([RLAPSI]{3})\b", head)
+    space = re.search(rb"\bSPACE=([RLAPSI]{3})\b", head)
     unit = re.search(rb"UNIT=(um|mm|cm|m|in)\b", head)
     axes = space[1].decode() if space else ""
     if kind == "VTK" and not space:

@@ -670,7 +670,7 @@ _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("att
 
 
 # at the start of a line, as the name of a solid is free text
-_STL_FACETS = re.compile(rb"[\r\n][ \t]*(facet|endsolid)\b", re.I)
+_STL_FACETS = re.compile(rb"[\r\n][ \t]*(facet|vertex|endsolid)\b", re.I)
 _STL_VERTEX = re.compile(rb"[\r\n][ \t]*vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.I)
 
 
@@ -700,6 +700,8 @@ def _read_stl(data):
         vertices, words = _STL_VERTEX.findall(data), _STL_FACETS.findall(data.lower())
         _need(3 * words.count(b"facet"), len(vertices), "vertices of facets")
         _need(1, words.count(b"endsolid"), "endsolid")
+        if not re.fullmatch(b"(e|fvvv)*", b"".join(word[:1] for word in words)):
+            raise ValueError("three vertices in every facet expected, found another number")
         corners = np.array(vertices, np.float64)
     else:
         _need(count, (len(data) - 84) // 50, "triangles")

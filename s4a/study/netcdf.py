@@ -124,6 +124,15 @@ def check_size(name: str, size: int, packed: int) -> None:
         raise OSError(f"{name} needs {size} bytes of memory, but has {packed} in the file")
 
 
+def check_texts(stored: h5d.DatasetID, name: str) -> None:
+    """Raise OSError if the texts of a variable are too long; many may share bytes of the file."""
+    texts, n_bytes = h5py.Dataset(stored), 0
+    for row in range(stored.shape[0]):
+        n_bytes += sum(map(len, np.ravel(texts[row])))
+        if n_bytes > LARGEST_TEXT:
+            raise OSError(f"{name} has more text than its file")
+
+
 def open_plain(path: Path | str) -> xr.Dataset:
     """Open a file as other netCDF programs do, after a check that all values are in it."""
     with open_hdf5(path) as file:
@@ -137,6 +146,8 @@ def open_plain(path: Path | str) -> xr.Dataset:
                 scale = h5py.Dataset(stored).attrs.get("NAME", b"")
                 if stored.get_storage_size() or not scale.startswith(NO_VARIABLE.encode()):
                     check_contained(stored, name.decode())
+                if stored.dtype.kind == "O" and stored.shape:
+                    check_texts(stored, name.decode())
     return xr.open_dataset(path, engine="h5netcdf", decode_times=False)
 
 

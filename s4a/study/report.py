@@ -73,7 +73,7 @@ def write_report(
     )
     report.attrs["unforeseen"] = " ".join(run.unforeseen)  # names of shapes, which have no blanks
     template_row = report.sel(shape=template)
-    if template_row["status"].item() == "flagged":
+    if options.template and template_row["status"].item() == "flagged":
         report.attrs["remarks"] += (
             f"\nthe template {template}, given by name, is flagged "
             f"({template_row['warning'].item()})"

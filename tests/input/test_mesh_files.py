@@ -407,6 +407,12 @@ def test_the_name_of_an_stl_solid_is_free_text(tmp_path, name):
     for end in ("\n", "\r\n", "\r"):
         text = f"solid {name}\n{facets}endsolid {name}\n".replace("\n", end)
         same_surface(file(tmp_path, "m.stl", text))
+    corner, end = "   vertex {} {} {}\n".format(*X[T[0, 2]]), "  endloop\n"
+    text = f"solid {name}\n{facets}endsolid\n".replace(corner + end, end, 1)
+    with pytest.raises(ValueError, match="three vertices in every facet expected"):  # two and four
+        read_mesh(
+            file(tmp_path, "m.stl", text.replace(end + " endfacet\nend", corner + end + "end"))
+        )
 
 
 def test_an_stl_file_with_a_second_one_behind_is_refused(tmp_path):

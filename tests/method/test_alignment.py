@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 import s4a
 from s4a.geometry.mesh import as_arrays, vertex_areas
-from s4a.method.alignment import align_all, align_onto, transform_onto
+from s4a.method.alignment import IDENTITY, align_all, align_onto, elect, transform_onto
 from s4a.method.shape import Basis
 
 SMALL = {"n_coarse": 150, "k": 20, "k_init": 10, "n_samples": 150, "intersections": False}
@@ -54,6 +54,17 @@ def test_shapes_vote_on_a_pose_that_the_reference_leaves_open():
     voted = align_onto(shape, target, voters=voters)
     thick = shape.X @ voted.R.T  # its thick end lies at large x, as those of the voters
     assert np.corrcoef(thick[:, 0], shape.X[:, 0])[0, 1] < -0.9
+
+
+def test_voters_with_one_clear_pose_outweigh_as_many_symmetric_ones():
+    shape = basis(*rod(1, end=0.6))
+    ends = {2: 0.0, 3: 0.0, 4: 0.6, 5: 0.6}
+    voters = {f"v{i}": (basis(*rod(i, end=end)), IDENTITY) for i, end in ends.items()}
+    rotations = [np.diag(signs) for signs in ([1.0, 1, 1], [-1.0, -1, 1])]
+    found = [(R, np.zeros(3)) for R in rotations]
+    assert not elect(shape, voters, found).ambiguity
+    symmetric = {name: voters[name] for name in ("v2", "v3")}
+    assert elect(shape, symmetric, found).ambiguity
 
 
 @pytest.mark.parametrize("alignment", ["search", "icp", "given"])
@@ -106,6 +117,7 @@ def test_a_study_flags_ambiguous_poses_and_its_confidence_falls():
     assert set(report["status"].values) == {"flagged"}
     assert set(report["flag_kinds"].values) == {"pose"}
     assert "all are used" in report.attrs["remarks"]
+    assert "given by name" not in report.attrs["remarks"]
     assert study["pca"].sizes["shape"] == 3
     others = report["shape"].values != study["registration"].attrs["template"]
     assert study["registration"]["confidence"].values[others].max() <= 0.5

@@ -508,3 +508,15 @@ def test_an_unfinished_study_is_reported_by_verify(folder):
     (folder / "report.nc").unlink()
     result = verify(folder)
     assert result["state"].sel(file="report.nc").item() == "missing"
+
+
+def test_texts_that_share_bytes_of_a_file_are_refused(tmp_path):
+    n, path = 1000, tmp_path / "a.nc"
+    with h5py.File(path, "w") as file:
+        texts = file.create_dataset("text", (n,), h5py.string_dtype())
+        texts[0] = "a" * 2**20
+        at = texts.id.get_offset()
+    data = path.read_bytes()  # every text is a reference of 16 bytes
+    path.write_bytes(data[:at] + n * data[at : at + 16] + data[at + 16 * n :])
+    with pytest.raises(OSError, match="text has more text than its file"):
+        netcdf.open_plain(path)

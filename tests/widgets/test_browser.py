@@ -222,6 +222,10 @@ def test_a_clicked_bar_shows_its_shape(page):
 
 def test_a_clicked_point_is_mapped_to_the_shape(page, study):
     open_tab(page, "Correspondence")
+    template = study["registration"].attrs["template"]
+    left = page.get_by_label("source", exact=True).filter(visible=True)
+    left.select_option(label=f"{template}, the template")
+    visible(page, ".s4a-title").filter(has_text=re.compile(f"^{template},")).first.wait_for()
     canvas = visible(page, VIEW).first
     box = canvas.bounding_box()
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
