@@ -32,11 +32,10 @@ from s4a.options import check
 from s4a.schema import POSE
 
 N_VOTERS = 6
-# of sqrt(area): poses fit alike if to a quarter of the voters the root of the difference of their
-# squared residuals is below it, and the mean difference is below MEAN times the same limit; shapes
-# of a collection differ from each other by about 0.04.  With fewer vertices than ENOUGH their
-# spacing hides part of the difference
-ALIKE, MEAN, ENOUGH = 0.023, 1.2, 500
+# poses fit alike if the root mean square residual to the voters is below ALIKE times that of the
+# best; or below NEARLY times, if one voter has the same residual but for SAME (of sqrt(area), root
+# of the difference of squares).  Shapes of a collection differ from each other by about 0.04
+ALIKE, NEARLY, SAME = 1.07, 1.2, 0.008
 _COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
 IDENTITY = np.eye(3), np.zeros(3)
 
@@ -174,11 +173,10 @@ def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Ali
     squared = np.array(rows)  # (voters, poses)
     order = np.argsort(squared.mean(0), kind="stable")
     squared, (R, t) = squared[:, order], found[order[0]]
-    limit = ALIKE**2 * min(1.0, len(source.X) / ENOUGH)
-    difference = squared - squared[:, :1]
-    alike = np.quantile(difference, 0.25, axis=0) < limit
-    alike &= difference.mean(0) < MEAN * limit
-    fits = tuple(np.sqrt(squared.mean(0)[alike]).tolist())
+    residual = np.sqrt(squared.mean(0))
+    same = abs(squared - squared[:, :1]).min(0) < SAME**2
+    alike = residual <= np.where(same, NEARLY, ALIKE) * residual[0]
+    fits = tuple(residual[alike].tolist())
     if len(fits) < 2 or _differs(source, voters, (R, t)):
         return Alignment(R, t, fits[:1])
     second = found[order[np.flatnonzero(alike)[1]]][0]
