@@ -29,7 +29,7 @@ from s4a.show.browser import color_bytes
 from s4a.show.charts import PALE
 from s4a.show.draw import cycle_error_colors, cycle_error_limits, position_colors
 from s4a.show.panel_page import widgets_in
-from s4a.show.surfaces import aligned, mesh_of, mode_limits
+from s4a.show.surfaces import aligned, mesh_of, mode_limits, network_limits
 from s4a.study.progress import status
 from s4a.widgets import (
     Correspondence,
@@ -241,7 +241,7 @@ def test_edges_are_coloured_before_and_after_on_one_scale(study, panel):
     network = panel(Network)
     bar = network.bar.value
     both = [study["network"][key].values for key in ("cycle_error_initial", "cycle_error")]
-    limits = np.min(both), np.max(both)
+    limits = network_limits(study)
     for key, errors in zip(("cycle_error_initial", "cycle_error"), both, strict=True):
         network.stage.value = key
         assert network.bar.value == bar
