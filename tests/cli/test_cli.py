@@ -73,7 +73,8 @@ def test_a_script_can_ask_for_an_exit_code_where_shapes_are_not_ok(ran, folder, 
 def test_run_writes_a_line_for_each_stage_where_there_is_no_terminal(ran):
     _, result = ran
     lines = [line for line in result.stderr.splitlines() if line.startswith("INFO: ")]
-    assert [line.split(": ")[1] for line in lines] == list(STAGES)
+    stages = [line.split(": ")[1] for line in lines]
+    assert [*dict.fromkeys(stages)] == list(STAGES)  # "align" has two groups of tasks
     assert re.fullmatch(r"INFO: registration: 4 of 4 tasks computed, [\d.]+ s, \d+ MiB", lines[-2])
     assert "it/s" not in result.stderr
 

@@ -124,7 +124,7 @@ def test_a_run_over_all_faults_ends_with_ten_good_shapes(in_python, checked, ran
         study[stage].to_dataset() for stage in ("network", "latent", "registration", "pca")
     ):
         for name, variable in data.variables.items():
-            if not name.startswith("cycle_error"):  # a pair in no 3-cycle has none
+            if "cycle_error" not in name:  # a pair in no 3-cycle has none
                 assert variable.dtype.kind != "f" or np.isfinite(variable.values).all(), name
     assert "genus 0: " in text
     assert "genus 1: handle" in text
