@@ -96,7 +96,7 @@ def test_rows_of_a_table_are_in_the_order_of_its_vertices(tmp_path):
     file.write_text("vertex,thickness\n2,30\n0,10\n1,20\n")
     assert read_scalars(file, "thickness").tolist() == [10, 20, 30]
     file.write_text("vertex,thickness\n2,30\n0,10\n2,20\n")
-    with pytest.raises(ValueError, match="'vertex' needs every index from 0 to 2 once"):
+    with pytest.raises(ValueError, match="every vertex from 0 to 2 needed once"):
         read_scalars(file, "thickness")
 
 

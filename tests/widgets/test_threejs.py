@@ -10,7 +10,7 @@ import s4a
 from s4a import synthetic
 from s4a.geometry.mesh import vertex_normals
 from s4a.show.draw import cycle_error_colors
-from s4a.show.surfaces import mode_limits
+from s4a.show.surfaces import mode_limits, network_limits
 
 pythreejs = pytest.importorskip("pythreejs")
 threejs = pytest.importorskip("s4a.widgets.threejs")
@@ -180,8 +180,7 @@ def test_the_network_is_placed_by_shape_differences_and_coloured_by_cycle_errors
         net["source"].values, net["target"].values, net["cycle_error"].values, strict=True
     ):
         mean.setdefault(frozenset((str(source), str(target))), []).append(error)
-    both = net["cycle_error_initial"].values, net["cycle_error"].values
-    limits = np.min(both), np.max(both)
+    limits = network_limits(study)
     assert (group.bar["low"], group.bar["high"]) == limits
     for segment, color in zip(lines.geometry.positions, lines.geometry.colors, strict=True):
         ends = [names[np.linalg.norm(positions - end, axis=1).argmin()] for end in segment]
