@@ -30,12 +30,13 @@ from s4a.evaluation.methods import (
     Pair,
     Spaces,
 )
-from s4a.geometry.align import align, realign, relative_transform
+from s4a.geometry.align import relative_transform
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.collection import Mesh, as_mesh, read_shapes
 from s4a.input.landmarks import locate
 from s4a.input.raw import content, npy, shown, text_of
 from s4a.method import latent, median, network
+from s4a.method.alignment import IDENTITY, pair_transform, transform_onto
 from s4a.method.initial_map import map_after_alignment
 from s4a.method.register import latent_functions, log_area_ratio, match_functions, match_low
 from s4a.method.shape import Basis, Shape
@@ -438,8 +439,8 @@ def compare_collection(
     n_coarse, n_pairs, k_init, k, step, seed, rng
         See :func:`s4a.analyse`.
     preset : {None, "paper"}
-        ``"paper"`` sets init="landmarks", n_samples=0 and dense_iterations=0; another value of
-        these is refused.
+        ``"paper"`` sets init="landmarks", n_samples=0, dense_iterations=0 and plain ICP; another
+        value of these is refused.
     init, n_samples, dense_iterations
         Options of the initial maps and of Consistent ZoomOut, see :func:`s4a.analyse`.
 
@@ -475,6 +476,7 @@ def compare_collection(
         "init": init,
         "n_samples": n_samples,
         "dense_iterations": dense_iterations,
+        "alignment": None,
     }
     presets = {name: {key: STUDY_PRESETS[name][key] for key in given} for name in (None, "paper")}
     given = apply_preset(preset, given, presets) | {"seed": seed_of(seed, rng)}
@@ -543,16 +545,17 @@ def initial_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.n
     k_init = min(options.k_init, *(basis.k for basis in bases))
     distance = network.spectral_distance([basis.eigenvalue[:k_init] for basis in bases])
     reference = bases[int(np.argmin(distance.sum(1)))]
-    identity = np.eye(3), np.zeros(3)
     transforms = [
-        identity if M is reference else align(M.cloud, reference.cloud)[:2] for M in bases
+        IDENTITY if M is reference else transform_onto(M, reference, options.alignment)
+        for M in bases
     ]
     settings: dict[str, Any] = {"k_init": k_init, "init": options.init}
     settings["n_samples"] = options.n_samples
     ends, maps = [], []
     for i, j in network.choose_pairs(distance, options.n_pairs):
         M, N = bases[i], bases[j]
-        R, t = realign(M.cloud, N.cloud, relative_transform(transforms[i], transforms[j]))
+        start = relative_transform(transforms[i], transforms[j])
+        R, t = pair_transform(M, N, start, options.alignment)
         maps.append(map_after_alignment(M, N, (R, t), **settings).C)
         maps.append(map_after_alignment(N, M, (R.T, -R.T @ t), **settings).C)
         ends += [(i, j), (j, i)]

@@ -84,7 +84,6 @@ def test_the_low_resolution_is_the_reduced_basis_of_scalable(sampled):
     assert coarse["position"].values == pytest.approx(X)
 
 
-@pytest.mark.xfail(reason="comparisons align all pairs by a search, the preset by plain ICP")
 def test_the_paper_on_scalable_is_what_table_2_compares(brains, paper):
     names = {"n_coarse": 400, "k_init": 10, "k": 24, "methods": ["SCALABLE"]}
     result = s4a.compare_collection(brains, preset="paper", **names).isel(algorithm=0)
