@@ -296,7 +296,7 @@ class Model:
         if factor > INFLATED:
             log.warning(
                 "the covariates explain most of the tested variable (variance inflation factor "
-                "%.2g): effects of the two cannot be told apart; omit covariates that measure the "
+                "%.2g): effects of the two cannot be separated; omit covariates that measure the "
                 "same",
                 factor,
             )

@@ -122,7 +122,7 @@ def _report_codes(codes, cells, names, what, others):
 
 
 def missing_codes(x: np.ndarray) -> np.ndarray:
-    """Return a mask of numbers ``(n,)`` that are a usual code of missing values, and stand apart.
+    """Return a mask of numbers ``(n,)`` that are a usual code of missing values, and outlying.
 
     Examples
     --------
@@ -220,7 +220,7 @@ def _p_of_new(value, rest, step):
 
 
 def look_alikes(cells: Sequence[str]) -> list[tuple[bool, list[str]]]:
-    """Return different texts that look alike, and whether they cannot be told apart by eye.
+    """Return different texts that look alike, and whether they cannot be distinguished by eye.
 
     Examples
     --------

@@ -17,6 +17,7 @@ from s4a.geometry.align import (
     N_POSES,
     ROUGH,
     RigidTransform,
+    align,
     icp,
     icp_each,
     point_to_point,
@@ -98,7 +99,7 @@ def transform_onto(
     if alignment == "icp":
         return point_to_point(source.cloud, target.cloud, *(start or IDENTITY))[:2]
     if start is None:
-        return poses(source.cloud, target.cloud)[0][:2]
+        return align(source.cloud, target.cloud)[:2]
     return realign(source.cloud, target.cloud, start)
 
 
@@ -165,7 +166,16 @@ def _after(first: RigidTransform, second: RigidTransform) -> RigidTransform:
 
 
 def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Alignment:
-    """Choose the pose with the least mean squared residual to the voters."""
+    """Choose the pose with the least mean squared residual to the voters.
+
+    Parameters
+    ----------
+    source : Basis
+    voters : dict
+        Shapes with their poses on the reference, the reference itself among them.
+    found : sequence of tuple (R, t)
+        Poses of the source on the reference.
+    """
     rows = []
     for other, onto in voters.values():
         starts = [relative_transform(pose, onto) for pose in found]

@@ -454,6 +454,13 @@ def fmap_from_landmarks(
     C : float ndarray (k, k)
     """
     F, G = landmark_descriptors(source, target, landmark_source, landmark_target)
+    return fit_to_landmarks(source, target, F, G, commute=commute)
+
+
+def fit_to_landmarks(
+    source: Basis, target: Basis, F: Array, G: Array, *, commute: float = LAPLACIAN
+) -> Array:
+    """Fit a functional map ``(k, k)`` to the :func:`landmark_descriptors` F and G."""
     penalty = commute * np.trace(F @ F.T) * _commutator(source.eigenvalue, target.eigenvalue)
     return fit(F, G, penalty=penalty, constant=_constant_to_constant(source, target))
 

@@ -95,8 +95,8 @@ def fit_after_alignment(
     if init == "wave_kernels":
         C = fmap.fmap_from_wave_kernels(source, target, *landmarks, k=k_init)
         return _InitialMap(init, C, C, near, landmarks)
-    C = fmap.fmap_from_landmarks(M, N, *landmarks)
     F, G = fmap.landmark_descriptors(M, N, *landmarks)
+    C = fmap.fit_to_landmarks(M, N, F, G)
     energies = fmap.landmark_energies(M, N, C, F, G)
     return _InitialMap(init, C, C, near, landmarks, (F, G), energies)
 

@@ -308,8 +308,8 @@ def coarsen(
     n_coarse : int
         Target number of vertices.  The result has between 95 % and 110 % of it, and usually 95 %,
         as the rest is for samples that the topology needs.  A mesh with hundreds of handles may
-        need more if n_coarse is in the hundreds.  A mesh that has no more
-        vertices than n_coarse is returned unchanged.
+        need more if n_coarse is in the hundreds.  A mesh that has no more vertices than n_coarse is
+        returned unchanged.
     sampling : {"normals", "geodesic"}
         Sample farthest points in position and normal, or along the surface as in ReMatching.  Then
         U is also that of ReMatching, from the closest point of the whole coarse mesh.
