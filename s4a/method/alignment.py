@@ -36,7 +36,8 @@ N_VOTERS = 6
 # poses fit alike if the root mean square residual to the voters is below ALIKE times that of the
 # best; or below NEARLY times, if one voter has the same residual but for SAME (of sqrt(area), root
 # of the difference of squares).  Shapes of a collection differ from each other by about 0.04.  With
-# fewer vertices than ENOUGH their spacing hides part of the difference
+# fewer vertices than ENOUGH their spacing hides part of the difference: ALIKE is nearer to 1, and
+# NEARLY does not apply
 ALIKE, NEARLY, SAME, ENOUGH = 1.07, 1.2, 0.008, 500
 _COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
 IDENTITY = np.eye(3), np.zeros(3)
@@ -186,8 +187,8 @@ def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Ali
     squared, (R, t) = squared[:, order], found[order[0]]
     residual = np.sqrt(squared.mean(0))
     known = min(1.0, len(source.X) / ENOUGH)
-    same = abs(squared - squared[:, :1]).min(0) < SAME**2 * known
-    alike = residual <= (1 + known * (np.where(same, NEARLY, ALIKE) - 1)) * residual[0]
+    same = (known == 1) & (abs(squared - squared[:, :1]).min(0) < SAME**2)
+    alike = residual <= np.where(same, NEARLY, 1 + known * (ALIKE - 1)) * residual[0]
     fits = tuple(residual[alike].tolist())
     if len(fits) < 2 or _differs(source, voters, (R, t)):
         return Alignment(R, t, fits[:1])
