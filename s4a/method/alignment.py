@@ -38,7 +38,7 @@ N_VOTERS = 6
 # of the difference of squares).  Shapes of a collection differ from each other by about 0.04.  With
 # fewer vertices than ENOUGH their spacing hides part of the difference: ALIKE is nearer to 1, and
 # NEARLY does not apply
-ALIKE, NEARLY, SAME, ENOUGH = 1.07, 1.2, 0.008, 500
+ALIKE, NEARLY, SAME, ENOUGH = 1.07, 1.2, 0.008, 400
 _COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
 IDENTITY = np.eye(3), np.zeros(3)
 
