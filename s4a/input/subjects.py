@@ -18,16 +18,8 @@ from s4a.schema import covariate
 
 log = logging.getLogger(__name__)
 
-MISSING = (
-    "",
-    "-",
-    "na",
-    "n/a",
-    "nan",
-    "#n/a",
-    "<na>",
-    "null",
-)  # cells without a value, in lower case
+# cells without a value, in lower case
+MISSING = ("", "-", "na", "n/a", "nan", "#n/a", "<na>", "null")
 # Cyrillic and Greek letters and dashes that look like Latin letters and the hyphen
 _SAME = str.maketrans(
     "аеорсухіѕјкмнтвΑΒΕΖΗΙΚΜΝΟΡΤΥΧαοινρυχ‐‑‒–—−", "aeopcyxisjkmhtbABEZHIKMNOPTYXaoivpux------"
