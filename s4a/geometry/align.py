@@ -395,7 +395,7 @@ def align(source: Cloud, target: Cloud) -> IcpResult:
 
     See Also
     --------
-    s4a.method.alignment.align_onto : Also detect poses that fit alike.
+    s4a.method.alignment.align_onto : Also detect equally good poses.
     rigid_transform : least-squares transform of corresponding points.
     """
     return poses(source, target)[0]

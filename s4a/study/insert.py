@@ -52,7 +52,7 @@ class Inserted(NamedTuple):
     Y: np.ndarray  # (k, m), latent basis
     registration: xr.Dataset
     comparison: xr.Dataset | None  # None if not compared
-    ambiguity: str  # message on several poses that fit alike
+    ambiguity: str  # message on equally good poses
 
 
 def insert(
