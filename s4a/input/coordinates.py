@@ -204,7 +204,7 @@ def common(systems: Mapping[str, CoordinateSystem], *, origin: bool = False) -> 
     if any(transform(a, b) is None for a in groups for b in groups):
         texts = "; ".join(f"{system}: {', '.join(names[:6])}" for system, names in groups.items())
         raise ValueError(
-            f"coordinate systems that can be converted to one needed, found {texts}: {REMEDY}"
+            f"convertible coordinate systems needed, found {texts}: {REMEDY}"
         )
     return max(groups, key=lambda system: len(groups[system]), default=CoordinateSystem())
 
