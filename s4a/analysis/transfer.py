@@ -39,7 +39,7 @@ from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
 from s4a.schema import check_type, dataset, require
-from s4a.study.pair import match_shapes, shape_of
+from s4a.study.pair import log_warning, match_shapes, shape_of
 from s4a.study.processes import workers
 from s4a.study.tree import stack_registration, template_mesh
 
@@ -289,7 +289,9 @@ def register_pairs(
         A study with the nodes
 
         - ``/original``: meshes of the template and of the shapes;
-        - ``/registration``: registration of each shape to the template;
+        - ``/registration``: registration of each shape to the template; the attributes ``status``
+          and ``warning`` of ``/registration/NAME`` flag registrations that are probably wrong, as
+          in :func:`s4a.match_pair`;
         - ``/reverse``: registration of the template to each shape, with `bidirectional`.
 
     Raises
@@ -331,6 +333,10 @@ def register_pairs(
         if settings.bidirectional
         else {}
     )
+    for n, registration in forth.items():
+        log_warning(registration, n)
+        if n in back:
+            log_warning(back[n], f"{n} in reverse")
     study = _study_of(name, meshes.pop(name), meshes, forth, back)
     study["registration"].attrs["preset"] = settings.preset or ""
     return study
@@ -388,6 +394,7 @@ def _routes_from_outside(
         inside = _shape_of(template, options)
     outside = _shape_of(mesh, options)
     forth, back = _match_both(inside, outside, options)
+    log_warning(forth, f"the registration of {name!r} to the external source")
     routes: list[Route] = [[(link(mesh, template, forth), "down")]]
     if back is not None:
         routes.append([(link(template, mesh, back), "up")])

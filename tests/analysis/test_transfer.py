@@ -41,6 +41,7 @@ from s4a.input.annotations import (
 )
 from s4a.input.landmarks import locate
 from s4a.schema import dataset
+from s4a.study import quality_control
 
 OPTIONS = {"n_coarse": 1200, "k": 60}
 
@@ -497,7 +498,9 @@ def test_labels_are_numbered_as_in_the_file_and_dropped_vertices_have_the_neares
         labels_of_mesh(height, mesh)
 
 
-def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path, meshes, capsys):
+def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(
+    tmp_path, meshes, capsys, monkeypatch
+):
     source, target = meshes["brain_01"], meshes["brain_02"]
     loose, L = as_arrays(synthetic.sphere(50, radius=2.0))
     X, T = as_arrays(target)
@@ -515,7 +518,12 @@ def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path
     label = np.load(tmp_path / "out" / "target one.labels.npy")
     assert label.shape == (len(points),)
     assert (label[50:] == target["label"].values).mean() > 0.93
-    assert cli.main([*command, "--out", str(tmp_path / "sharp"), "--blur", "0"]) == 0
+    monkeypatch.setattr(quality_control, "FLAGGED", 0.0)
+    monkeypatch.setattr(quality_control, "WRONG_RATIO", 0.0)
+    sharp = ["--out", str(tmp_path / "sharp"), "--blur", "0", "--fail-on", "flagged"]
+    assert cli.main([*command, *sharp]) == 3
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert "flagged: registration probably wrong (score 0.0" in last
     sharp = np.load(tmp_path / "sharp" / "target one.labels.npy")
     assert 0.95 < (sharp == label).mean() < 1
     sure = np.load(tmp_path / "out" / "target one.confidence.npy")
