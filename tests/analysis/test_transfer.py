@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from s4a import (
     clean,
     cli,
+    correspondence,
     match_pair,
     register_pairs,
     synthetic,
@@ -90,6 +91,15 @@ def test_labels_and_landmarks_of_a_moved_and_renumbered_copy_are_exact(meshes, m
     assert (found["label"].values == order).all()
     assert found["label_share"].values == pytest.approx(1, abs=1e-4)
     assert found["confidence"].values == pytest.approx(1, abs=1e-3)
+    Y, S = as_arrays(copy)
+    for ends, true, X, T in (
+        (("target", "source"), np.argsort(order), Y, S),
+        (("source", "target"), order, *as_arrays(mesh)),
+    ):
+        image = correspondence(study, *ends)
+        assert distance(image["image_position"].values, X[true]).max() < 1e-4 * size
+        corner = image["image_barycentric"].values.argmax(1)
+        assert (T[image["image_triangle"].values, corner] == true).all()
     landmarks = mesh[["landmark_name", "landmark_position"]]
     marks = transfer_landmarks(study, landmarks)["source"]
     exact = locate(landmarks, mesh)["landmark_position"].values @ R.T + [30, -20, 5]
