@@ -682,7 +682,9 @@ def transfer_landmarks(
           coordinates of its mesh;
         - ``landmark_triangle(landmark)`` and ``landmark_barycentric(landmark, corner)``: triangle
           and barycentric coordinates of these points;
-        - ``landmark_confidence(landmark)``: confidence of the match, from 0 to 1;
+        - ``landmark_confidence(landmark)``: confidence of the match, from 0 to 1.  It finds failed
+          regions of shapes in different poses; among shapes in similar poses it is an average of
+          the group and does not rank the points by their error;
         - ``landmark_disagreement(landmark)``, if several matches are averaged: largest distance of
           one of their results from the mean;
         - ``landmark_curve`` and ``landmark_closed``, with curves: name of the curve of each point,
