@@ -506,16 +506,19 @@ class LatentCollection(NamedTuple):
     distance_to_limit: xr.Variable
     seconds: list[float]
 
+    def functions(
+        self, source: int, target: int, dense_match: str
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the functions of both shapes that eq. 4 or eq. 7 compares, at low resolution."""
+        ends = self.shapes[source], self.shapes[target], (self.Y[source], self.Y[target])
+        if dense_match == DENSE_MATCHES[0]:
+            return match_low(*ends, dense_match=dense_match)[1]
+        return latent_functions(*ends)
+
     def match(self, source: int, target: int, dense_match: str) -> np.ndarray:
-        """Return the matched vertices of the source ``(n_target,)`` by eq. 4 or 7."""
-        M, N = ends = self.shapes[source], self.shapes[target]
-        bases = self.Y[source], self.Y[target]
-        functions = (
-            match_low(*ends, bases, dense_match=dense_match)[1]
-            if dense_match == DENSE_MATCHES[0]
-            else latent_functions(*ends, bases)
-        )
-        return match_functions(M, N, *functions)[0]
+        """Return the matched vertices of the source ``(n_target,)`` by eq. 4 or eq. 7."""
+        functions = self.functions(source, target, dense_match)
+        return match_functions(self.shapes[source], self.shapes[target], *functions)[0]
 
 
 def run_collection(
