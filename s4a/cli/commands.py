@@ -430,7 +430,7 @@ def transfer(
         smooth the votes for labels over this multiple of the estimated match error; 0: not at all
         (default: 1; 0 with --preset paper)
     fail_on
-        end with exit code 3 if targets are excluded, or if targets are flagged or excluded
+        end with exit code 3 if targets are excluded, or also if they are flagged
     """
     if not (labels or source_landmarks):
         raise ValueError("nothing to transfer: give --labels FILE, --source-landmarks FILE or both")

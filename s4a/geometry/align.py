@@ -383,7 +383,7 @@ def poses(source: Cloud, target: Cloud) -> list[IcpResult]:
 
 
 def distinct(ends: list[IcpResult]) -> list[IcpResult]:
-    """Sort results of ICP by residual, without those within ``DISTINCT`` degrees of a better one."""
+    """Sort results of ICP by residual; omit those within ``DISTINCT`` degrees of a better one."""
     chosen: list[IcpResult] = []
     for end in sorted(ends, key=residual_of):
         # the trace of a rotation is 1 + 2 cos(angle)
