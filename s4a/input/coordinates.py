@@ -203,9 +203,7 @@ def common(systems: Mapping[str, CoordinateSystem], *, origin: bool = False) -> 
     groups = {s: [n for n in own if own[n] == s] for s in own.values()}
     if any(transform(a, b) is None for a in groups for b in groups):
         texts = "; ".join(f"{system}: {', '.join(names[:6])}" for system, names in groups.items())
-        raise ValueError(
-            f"convertible coordinate systems needed, found {texts}: {REMEDY}"
-        )
+        raise ValueError(f"convertible coordinate systems needed, found {texts}: {REMEDY}")
     return max(groups, key=lambda system: len(groups[system]), default=CoordinateSystem())
 
 
