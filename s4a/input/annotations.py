@@ -113,6 +113,8 @@ def _gifti_vector(data, intent="LABEL"):
     found = found or [values for _, values in arrays if values.ndim == 1]
     if not found:
         raise ValueError("a GIFTI array of one dimension needed, found none")
+    if len(found) > 1:
+        log.warning("the first of %d arrays of a GIFTI file is used", len(found))
     return found[0]
 
 
@@ -177,7 +179,13 @@ def _colour_table(file):
         row = file.number() if numbered else i
         file.take(file.number())  # name of the structure
         colour = np.array(file.numbers(4), "u1").view("<i4").item()
-        row_of_colour.setdefault(colour, row)
+        if row_of_colour.setdefault(colour, row) != row:
+            log.warning(
+                "rows %d and %d of a colour table have one colour, so the label of both is %d",
+                row_of_colour[colour],
+                row,
+                row_of_colour[colour],
+            )
     opaque = {colour % 2**24: row for colour, row in row_of_colour.items()}
     return opaque | row_of_colour | {0: -1}
 
@@ -268,6 +276,11 @@ def is_number(text: str) -> bool:
 
 
 def _text_labels(data):
+    if data.startswith(b"#!ascii label"):
+        raise ValueError(
+            "one label for every vertex expected, found some vertices (a FreeSurfer label): "
+            "convert it to .annot by mris_label2annot"
+        )
     rows = table_rows(text_of(data))
     header = next(iter(rows.values()))
     head = [cell.lower() for cell in header]
@@ -399,11 +412,14 @@ def _scalismo_points(text):
     return CoordinateSystem(), [(mark["id"], mark["coordinates"]) for mark in json.loads(text)]
 
 
+_AXES = {"0": "RAS", "1": "LPS"}  # numbers of coordinate systems of 3D Slicer
+
+
 def _slicer_points(text):
     lists = json.loads(text)["markups"]
     axes = "coordinateSystem"  # of a list, or of a point
     systems = {
-        str(p.get(axes, m.get(axes, "LPS"))).upper()
+        _AXES.get(text := str(p.get(axes, m.get(axes, "LPS"))).upper(), text)
         for m in lists
         for p in (m, *(m.get("controlPoints") or []))
     }
@@ -423,7 +439,8 @@ def _slicer_points(text):
             (p.get("label", ""), p["position"], curve, m.get("type") == "ClosedCurve")
             for p in points
         ]
-    units = {u for m in lists for u in np.ravel(m.get("coordinateUnits") or "mm").tolist()}
+    # a unit may be a list of its code, the scheme of the code and its meaning
+    units = {np.ravel(m.get("coordinateUnits") or "mm").tolist()[0] for m in lists}
     if len(units) != 1 or not units <= {*MILLIMETRES}:
         raise ValueError(f"one of {', '.join(MILLIMETRES)} as unit needed, found {sorted(units)}")
     return CoordinateSystem(systems.pop(), "", units.pop()), rows
@@ -436,14 +453,18 @@ def _meshlab_points(text):
 
 
 def _table_points(text):
-    system, columns = CoordinateSystem(), re.compile(r"(?m)^#\s*columns\s*=\s*")
+    columns = re.compile(r"(?m)^#\s*columns\s*=\s*")
+    stated = [r"(?:SPACE|CoordinateSystem)\s*=\s*(\w+)", r"UNIT\s*=\s*(um|mm|cm|m|in)\b"]
+    found = [re.search(rf"(?m)^#.*?\b{one}", text) for one in stated]
+    axes, unit = (one[1] if one else "" for one in found)
     if columns.search(text):  # .fcsv of 3D Slicer, of old versions without a system, or with 0
-        found = re.search(r"(?m)^#\s*CoordinateSystem\s*=\s*(\w+)", text)
-        axes = found[1] if found else "0"
-        axes = {"0": "RAS", "1": "LPS"}.get(axes, axes)
-        system = CoordinateSystem.of({"coordinate_system": axes, "unit": "mm"})
-    rows = table_rows(columns.sub("", text, count=1))
+        axes, unit = axes or "0", unit or "mm"
+    attrs = {"coordinate_system": _AXES.get(axes, axes), "unit": unit}
+    system, rows = CoordinateSystem.of(attrs), table_rows(columns.sub("", text, count=1))
     header = next(iter(rows.values()))
+    if columns.search(text) and len(header) == 14:
+        # 3D Slicer 5 adds two cells, of which the first is 2 for a point that has a position
+        rows = {n: row[:14] for n, row in rows.items() if row[14:15] in ([], [""], ["2"])}
     head = [cell.lower() for cell in header]
     name, curve, closed = None, None, None
     letters = next((axes for axes in ("xyz", "lps", "ras") if {*axes} <= {*head}), "")

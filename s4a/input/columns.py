@@ -10,15 +10,17 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import stdtr
 
-from s4a.input.subjects import is_plain_number, listed, look_alikes
+from s4a.input.subjects import is_plain_number, listed, look, look_alikes
 
 log = logging.getLogger(__name__)
 
 # -9, 99, -999, 9998 and similar, and the largest integers of 16 and 32 bits
-_CODES = re.compile(r"-1|-?(9*[789]|77+|88+|32768|2147483648)|32767|65535|2147483647")
+_CODES = re.compile(r"-1|-?(9*[789]|77+|88+|9+\.9+|32768|2147483648)|32767|65535|2147483647")
 _WORDS = re.compile(
-    r"[?.]+|none|unknown|missing|not? (available|data)|n\.a\.|n\.?d\.?|#.*[!?]", re.IGNORECASE
+    r"[?.]+|none|unknown|missing|not? (available|applicable|data)|n\.a\.|n\.?d\.?|#.*[!?]",
+    re.IGNORECASE,
 )
+_NUMBERS = {"true": "1", "yes": "1", "false": "0", "no": "0"}
 _ALONE = 0.995  # share of the variance of a column that an outlier may have
 _LEVEL, _SLIP_LEVEL = 3e-4, 0.04  # of an outlier in a column; of a value ten times the others
 
@@ -78,8 +80,14 @@ def _check_names(cells, names, what):
                 "same name for the same group"
             )
         log.warning("%sdiffer only in case or similar letters: are these different groups?", text)
+    letters = {cell.casefold(): cell for cell in cells if len(cell) == 1}
+    for word in sorted({cell for cell in cells if len(cell) > 2 or look(cell) == "no"}):
+        letter = letters.get(word[0].casefold(), letters.get(_NUMBERS.get(look(word), "")))
+        if letter:
+            log.warning("%s: are %r and %r different groups?", what, letter, word)
 
 
+@np.errstate(all="ignore")  # of numbers near the largest
 def _check_numbers(x, names, what):
     """Check a column of numbers."""
     known = np.isfinite(x)
@@ -103,6 +111,20 @@ def _check_numbers(x, names, what):
                 "compare it with all others: correct the value, or write NA"
             )
         log.warning("%s: correct the value, or write NA, if it is wrong; the test uses it", text)
+    for low, high in _two_sizes(x[rest & ~far]):
+        found = f"{min(low):.10g} to {max(low):.10g} and {min(high):.10g} to {max(high):.10g}"
+        log.warning("%s: values of two sizes, %s: are all in one unit?", what, found)
+
+
+def _two_sizes(x):
+    """Positive values as two parts, if one is about 100 or 1000 times the other; else nothing."""
+    x = np.sort(x[x != 0])
+    at = 1 + int(np.argmax(np.diff(np.log(x)))) if len(x) > 1 and x[0] > 0 else 0
+    low, high = x[:at], x[at:]
+    if min(len(low), len(high)) > 1 and low[-1] < 4 * low[0] and high[-1] < 4 * high[0]:
+        factor = np.log10(np.median(high) / np.median(low))
+        if factor > 1.5 and abs(factor - round(factor)) < 0.2:
+            yield low, high
 
 
 def _report_codes(codes, cells, names, what, others):
@@ -112,7 +134,7 @@ def _report_codes(codes, cells, names, what, others):
         return
     numbers = [float(cells[i]) for i in np.flatnonzero(codes) if is_plain_number(cells[i])]
     others = f" ({others})" if others else ""
-    if any(x < -10 or x > 99 for x in numbers):  # others may be values
+    if any(x < -10 or x >= 100 for x in numbers):  # others may be values
         raise ValueError(
             f"{what}: {found} is a code of a missing value{others}: write NA, or, if it is a "
             "value, give the column in another unit"
@@ -132,10 +154,10 @@ def missing_codes(x: np.ndarray) -> np.ndarray:
     >>> missing_codes(np.array([-9, -4, 7, 12.0])).any()
     np.False_
     """
-    possible, found = _usual(x), np.zeros(len(x), bool)
+    possible, found = _usual(x) | (x == 0), np.zeros(len(x), bool)
     for code in np.unique(x[possible]):
-        # -1 and one digit of the other sign may be values
-        digit = (abs(x) < 10) & ((x * code < 0) | (x == -1)) & (x != code)
+        # 0, -1 and one digit of the other sign may be values
+        digit = (abs(x) < 10) & ((x * code < 0) | (x == -1) | (x == 0)) & (x != code)
         rest = x[~possible | digit]
         if len(np.unique(rest)) > 1:
             found |= (x == code) & _is_code(code, rest, (x == code).sum())
@@ -151,14 +173,18 @@ def _is_code(code, rest, count):
     """Return whether a usual code is far enough from the other values of its column to be one."""
     if abs(code) < 10 and rest.min() < 0:
         return False  # of differences
+    if code == 0:  # among values that differ too little for a zero
+        steps = np.diff(np.unique(rest))
+        is_narrow = len(steps) > 3 and 2 * steps.max() < rest.min() and rest.max() < 4 * rest.min()
+        return bool(is_narrow and 3 * count <= len(rest))
     low, high, decimals = rest.min(), rest.max(), (rest % 1 != 0).mean()
     gap = low - code if code < 0 else code - high
     extent = (high - low) * (1 + 4 / len(rest))  # the extent of few values is uncertain
     if code < 0 <= low:
         is_far = low >= max(5, -code) or gap > max(3, 2 * extent)
         return code < -10 or is_far or (len(rest) > 3 and code < -1 and decimals > 0.75)
-    if abs(code) > 99 and len(rest) > 4 and decimals == 1:
-        return True  # the only integer
+    if abs(code) > 99 and len(rest) > 4 and decimals == (code % 1 == 0):
+        return True  # the only integer, or the only decimal
     if count > 1:
         extent = max(np.diff(np.unique(rest)).max(), (high - low) / 4)
     return bool(gap > max(3, extent))
@@ -169,7 +195,7 @@ def outlying(x: np.ndarray) -> np.ndarray:
 
     A value is compared with the others, and positive ones by their logarithms too, by the t
     distribution of a new observation.  A value that is 10, 100 or 1000 times one in their range, as
-    290 for 29, needs less evidence.
+    290 for 29, or of the other sign, needs less evidence.
 
     Examples
     --------
@@ -195,7 +221,7 @@ def outlying(x: np.ndarray) -> np.ndarray:
 
 def _is_outlying(value, rest, n):
     low, high = np.quantile(rest, [0.1, 0.9])
-    slips = value / 10.0 ** np.array([-3, -2, -1, 1, 2, 3])
+    slips = value / np.array([1e-3, 1e-2, 0.1, 10, 100, 1000, -1])
     is_slip = 0 < high < 4 * low and ((slips >= low) & (slips <= high)).any()
     return _p_value(value, rest) * n < (_SLIP_LEVEL if is_slip else _LEVEL)
 

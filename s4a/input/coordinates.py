@@ -325,10 +325,13 @@ def _of_freesurfer(data):
 
 
 def surface_system(M: Any) -> CoordinateSystem:
-    """Return surface RAS with its map (3, 4) to scanner RAS."""
-    numbers = " ".join(map(repr, (np.asarray(M, float) + 0.0).ravel().tolist()))
+    """Return surface RAS, or LAS if mirrored, with the map (3, 4) of its points to scanner RAS."""
+    M = np.reshape(np.asarray(M, float), (3, 4))
+    axes = "LAS" if np.linalg.det(M[:, :3]) < 0 else "RAS"  # of a left-handed volume: mirrored
+    M = M @ np.diag([-1 if axes == "LAS" else 1, 1, 1, 1]) + 0.0
+    numbers = " ".join(map(repr, M.ravel().tolist()))
     return CoordinateSystem.of(
-        {"coordinate_system": f"surface RAS, to scanner RAS {numbers}", "unit": "mm"}
+        {"coordinate_system": f"surface {axes}, to scanner RAS {numbers}", "unit": "mm"}
     )
 
 
@@ -352,12 +355,13 @@ def _of_gifti(data):
         maps[there] = (node.findtext("MatrixData") or "").split()
     meta = {m.findtext("Name"): m.findtext("Value") for m in root.iter("MD")}
     geometry = [[meta.get(f"VolGeom{a}_{b}") for b in "RAS"] for a in "XYZC"]
-    if all(word for row in geometry for word in row):
-        return _of_volume(*np.array(geometry, float))
     to_scanner = maps.get(1, maps.get(2, ()))
-    if len(to_scanner) == 16:
-        return surface_system(to_scanner[:12])
-    return CoordinateSystem("RAS", UNKNOWN, "mm")
+    found = [surface_system(to_scanner[:12])] if len(to_scanner) == 16 else []
+    if all(word for row in geometry for word in row):
+        found.append(_of_volume(*np.array(geometry, float)))
+    if found and np.allclose(*(s.to_scanner for s in (found[0], found[-1])), atol=1e-3):
+        return found[-1]
+    return CoordinateSystem("RAS", UNKNOWN, "mm")  # nothing, or two that differ
 
 
 def nifti_system(code: int) -> CoordinateSystem:

@@ -73,6 +73,9 @@ def _parse_vtk(data):
             if section in (b"POLYGONS", b"TRIANGLE_STRIPS"):
                 cells.append(found)
         elif section in (b"POINT_DATA", b"CELL_DATA"):
+            if second := re.search(rb"\n# vtk DataFile Version", data[file.at :]):
+                at = file.at + second.start() + 1
+                raise ValueError(f"one mesh expected, found a second VTK at byte {at}: {_REMEDY}")
             break
         elif section == b"METADATA":  # to the next empty line
             file.at = next(re.compile(rb"\n[ \t\r]*\n|\Z").finditer(data, file.at - 1)).end()
@@ -392,17 +395,21 @@ _MAGICS = {
     "a glTF file": rb"glTF|\s*\{.*\"asset\"\s*:",
     "a DICOM file": rb".{128}DICM",
     "a MetaImage or MRtrix volume": rb"ObjectType\s*=|mrtrix image",
-    "an FBX, Blender, Gmsh or STEP file": rb"Kaydara FBX|BLENDER|\$MeshFormat|ISO-10303",
+    "an FBX, Blender or Gmsh file": rb"Kaydara FBX|; FBX |BLENDER|\$MeshFormat",
+    "a STEP or IGES file": rb"ISO-10303|[ -~]{72}S +1\s",
+    "a USD, VRML, Inventor or Draco file": rb"PXR-USDC|#usda|#VRML|#Inventor|DRACO",
+    "an Amira or BrainSuite file": rb"# (Avizo|AmiraMesh|HyperSurface)|DFS_[LB]E",
     "a streamlines file": rb"TRACK\0|mrtrix tracks",
-    "values per vertex of FreeSurfer": rb"\xff{3}",
+    "values per vertex, or quadrangles, of FreeSurfer": rb"\xff\xff[\xff\xfd]",
+    "a surface of FreeSurfer as text": rb"#!ascii",
     "a BrainVISA mesh": rb"(ascii|binar)(DCBA|ABCD)",
     "a binary MNI surface": rb"p[\0-\xff]{3}[\x3c-\x3f]",
     "an NPY array": rb"\x93NUMPY",
     "a picture": rb"\x89PNG|\xff\xd8\xff|GIF8|II\*\0|MM\0\*",
     "a PDF file": rb"%PDF",
-    "a compressed file": rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|\x28\xb5\x2f\xfd|Rar!",
-    "a pointer of Git LFS": rb"version https://git-lfs",
-    "a web page": rb"\s*<(![dD][oO][cC][tT][yY][pP][eE] )?(html|HTML)",
+    "a compressed file: unpack it": rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|\x28\xb5\x2f\xfd|Rar!",
+    "a pointer of Git LFS: git lfs pull downloads the file": rb"version https://git-lfs",
+    "a web page: download the file again": rb"(?i)\s*<(.{0,1000}<)?(!doctype )?(html|head)\b",
     "a COLLADA or X3D file": rb"\s*<.{0,1000}<(COLLADA|X3D)\b",
     "a program": rb"\x7fELF|MZ[\x80-\xff]",
 }
@@ -436,7 +443,8 @@ def format_of(data: bytes) -> str:
     if not other and b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
         return "OBJ"
     what = f"{len(data)} bytes" + " of an unknown format" * bool(data)
-    found = f"{other}: export the surface as one of them" if other else what
+    found = other or what
+    found += ": export the surface as one of them" * bool(other and ":" not in other)
     raise ValueError(f"one of {', '.join(FORMATS)} expected, found {found}")
 
 
@@ -701,7 +709,7 @@ def _read_stl(data):
     if starts_as_ascii and len(data) != 84 + 50 * count:
         vertices, words = _STL_VERTEX.findall(data), _STL_FACETS.findall(data.lower())
         _need(3 * words.count(b"facet"), len(vertices), "vertices of facets")
-        _need(1, words.count(b"endsolid"), "endsolid")
+        _need(1, words[-1:].count(b"endsolid"), "endsolid at the end")
         if not re.fullmatch(b"(e|fvvv)*", b"".join(word[:1] for word in words)):
             raise ValueError("three vertices in every facet expected, found another number")
         corners = np.array(vertices, np.float64)
@@ -846,7 +854,7 @@ def _read_npz(data):
     if keys is None:
         wanted = " or ".join(" and ".join(keys) for keys in NPZ_KEYS)
         found = ", ".join(arrays) or "nothing"
-        raise ValueError(f"the keys {wanted} expected, found a ZIP archive of {found}")
+        raise ValueError(f"the keys {wanted} expected, found a ZIP archive of {found}: unpack it")
     points, triangles = (arrays[key]() for key in keys)
     if triangles.dtype.kind not in "iu":
         raise ValueError(f"integer indices expected in {keys[1]}, found {triangles.dtype}")

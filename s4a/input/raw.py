@@ -92,7 +92,8 @@ def reading(path: _AnyPath, what: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # no file may end the run over a collection
-        why = shown(error) or type(error).__name__
+        missing = "expected, found none" if isinstance(error, KeyError) else ""
+        why = f"{shown(error)} {missing}".strip() or type(error).__name__
         raise ValueError(f"{shown(path)} cannot be read as {what}: {why}") from error
 
 

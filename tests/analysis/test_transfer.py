@@ -340,12 +340,29 @@ def test_every_label_file_gives_the_same_labels(tmp_path):
     assert read_labels(tmp_path / "names.csv", 2).tolist() == ["left", "right"]
 
 
+def test_labels_of_which_some_are_lost_are_reported(tmp_path, caplog):
+    colours = np.array([[1, 2, 3, 0, 0], [1, 2, 3, 0, 0]])
+    nibabel.freesurfer.write_annot(
+        tmp_path / "lh.annot", np.array([0, 1]), colours, ["a", "b"], fill_ctab=True
+    )
+    assert read_labels(tmp_path / "lh.annot", 2).tolist() == [0, 0]
+    assert (
+        "rows 0 and 1 of a colour table have one colour, so the label of both is 0" in caplog.text
+    )
+    array = nibabel.gifti.GiftiDataArray(np.arange(2, dtype=np.int32), "NIFTI_INTENT_LABEL")
+    nibabel.save(nibabel.gifti.GiftiImage(darrays=[array, array]), tmp_path / "a.label.gii")
+    assert read_labels(tmp_path / "a.label.gii", 2).tolist() == [0, 1]
+    assert "the first of 2 arrays of a GIFTI file is used" in caplog.text
+
+
 def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
     np.save(tmp_path / "a.npy", np.arange(4))
     np.save(tmp_path / "half.npy", np.array([0.5, 1]))
     np.savez(tmp_path / "two.npz", p=np.arange(4), q=np.arange(4))
     (tmp_path / "a.csv").write_text("p,q\n1,2\n")
+    (tmp_path / "lh.label").write_text("#!ascii label  , from subject\n1\n99 1 2 3 0\n")
     for name, n, text in (
+        ("lh.label", 5, "one label for every vertex expected, found some vertices"),
         ("a.npy", 5, r"a.npy: 5 labels.* found an array of shape \(4,\)"),
         ("half.npy", 2, "half.npy: labels need integers or names, found 0.5"),
         (

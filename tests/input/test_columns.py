@@ -36,13 +36,18 @@ def test_a_test_with_a_code_of_missing_values_is_refused(code, caplog):
 
 
 def test_other_codes_and_outliers_are_named_with_the_values_of_the_others(caplog):
-    for code in (-9, -1, -8):
+    for code in (-9, -1, -8, 0, 99.9, -9.99):
         assert f"{code} of s3 may be a code of a missing value (others 20" in findings(
             with_value(code), caplog
         )
     found = findings(with_value(290), caplog)
     assert "outliers, 290 of s3 (others 20 to 54): correct the value, or write NA" in found
-    for value in (1e10, -1e5):
+    assert "outliers, -31 of s3" in findings(with_value(-31), caplog)
+    mixed = np.where(np.arange(12) % 2, 1.5 + 0.03 * np.arange(12), 150 + 3 * np.arange(12))
+    assert "values of two sizes, 1.53 to 1.83 and 150 to 180: are all in one unit?" in findings(
+        mixed, caplog
+    )
+    for value in (1e10, -1e5, 1.7e308):
         assert "error: it: outliers" in findings(with_value(value), caplog)
         assert "variance is of one shape" in findings(with_value(value), caplog)
     assert "99 of s2, 99 of s7 may be a code" in findings(with_value(99, 2, 7), caplog)
@@ -66,6 +71,9 @@ def test_clean_columns_are_not_reported(caplog):
             rng.normal(0, 5, 20 * n).round(),
             *(rng.choice([-1, 1], n), np.arange(n), 1000 + rng.permutation(n), np.full(n, 9.0)),
             *([-999.0] * n, with_value(np.nan, values=adults)),
+            # zeros among doses, visits, counts; 0, 100 and 200
+            *(np.arange(n) % 4 * 10, np.where(np.arange(n) % 2, rng.integers(20, 60, n), 0)),
+            *(rng.poisson(5, n), np.arange(n) % 3 * 100, np.where(np.arange(n) % 3, 1, 200)),
         ):
             assert not findings(column, caplog), column
     assert not findings(["Aa", "AA", "b", "Müller"], caplog).startswith("error")
@@ -109,6 +117,14 @@ def test_codes_among_names_of_groups_are_named(caplog):
     for cell in ("?", "None", "no data", "n.d."):
         assert f"{cell} of s2 may be a code" in findings(["f", "m", cell, "f"], caplog)
     assert "-9 of s2 may" in findings([1, 2, -9, 1, 2], caplog, categories=True)
+
+
+def test_abbreviations_among_names_of_groups_are_named(caplog):
+    for names in (["m", "Male"], ["1", "True"], ["0", "no"]):
+        found = findings([*names, "b", "c", *names], caplog)
+        assert "it: are {!r} and {!r} different groups?".format(*names) in found
+    for names in (["A", "AB"], ["a", "bc"], ["0", "1"], ["1", "none of"]):
+        assert "different groups" not in findings(names * 3, caplog)
 
 
 def test_tables_of_windows_and_excel_are_read(tmp_path, caplog):

@@ -88,6 +88,13 @@ def test_every_format_says_its_coordinate_system(tmp_path):
         gifti(tmp_path / "d.gii", (4, 4)): "MNI152 RAS",
         gifti(tmp_path / "e.gii", (0, 1), moved): surface,
         gifti(tmp_path / "f.gii", (0, 3), **axes): surface,
+        gifti(tmp_path / "h.gii", (0, 1), moved, **axes): surface,
+        gifti(tmp_path / "i.gii", (0, 1), np.eye(4), **axes): "RAS, origin unknown",  # two origins
+        # of left-handed volumes: a mirror image
+        gifti(tmp_path / "j.gii", (0, 1), np.diag([-1, 1, 1, 1])): "surface LAS, c_ras 0 0 0",
+        freesurfer(tmp_path / "d.pial", directions=DIRECTIONS * [[-1], [1], [1]]): surface.replace(
+            "RAS", "LAS", 1
+        ),
     }
     files = {
         "a.vtk": (vtk_bytes(X, T, {}, LIKE_SLICER.format("LPS")), "LPS"),
@@ -226,6 +233,7 @@ def test_landmarks_lie_on_the_surface_whatever_the_two_files_say(tmp_path):
 
 
 HEAD = "# Markups fiducial file version = 4.11\n"
+MARKUPS = '{"markups": [{"coordinateSystem": %s, "controlPoints": [%s]}]}'
 COLUMNS = "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
 FCSV = "n_{0},{1},{2},{3},0,0,0,1,1,1,0,{4},,\n"
 
@@ -250,6 +258,13 @@ def test_landmark_files_of_other_programs_are_read(tmp_path):
     files = {
         "lps.fcsv": (f"{HEAD}# CoordinateSystem = LPS\n{COLUMNS}{fcsv}", "LPS", names),
         "one.fcsv": (f"{HEAD}# CoordinateSystem = 1\n{COLUMNS}{fcsv}", "LPS", names),
+        "five.fcsv": (  # of 3D Slicer 5: 2 for a position, 0 for none
+            HEAD + "# CoordinateSystem = LPS\n" + COLUMNS + fcsv.replace("\n", ",2,0\n")
+            + FCSV.format(3, 0, 0, 0, "c").replace("\n", ",0,0\n"), "LPS", names),
+        "stated.csv": (f"# SPACE=LPS UNIT=mm\nlabel,x,y,z,defined,selected\n{csv}", "LPS", names),
+        "units.mrk.json": (MARKUPS % ('"1", "coordinateUnits": ["mm", "UCUM", "millimeter"]',
+            ", ".join(f'{{"label": "{n}", "position": {p}}}'
+                      for n, p in zip(names, P.tolist(), strict=True))), "LPS", names),
         "old.fcsv": (f"{HEAD}# CoordinateSystem = 0\n{COLUMNS}{fcsv}", "RAS", names),
         "lps.csv": (f"label,l,p,s,defined,selected\n{csv}c,0,0,0,0,1\n", "LPS", names),
         "ras.csv": (f"label,r,a,s,defined,selected\n{csv}", "RAS", names),
@@ -277,9 +292,10 @@ def test_landmark_files_of_other_programs_are_read(tmp_path):
     (tmp_path / "a.tps").write_text("LM=2\n1 2\nID=x\n")
     (tmp_path / "a.pts").write_text(f"Version 1.0\n3\n{plain}")
     (tmp_path / "lps.fcsv").write_text(f"# CoordinateSystem = XYZ\n{COLUMNS}{fcsv}")
-    markups = '{"markups": [{"coordinateSystem": "LPS", "controlPoints": [%s]}]}'
     point = '{"position": [1, 2, 3], "coordinateSystem": "RAS"}'
-    (tmp_path / "a.mrk.json").write_text(markups % point)
+    (tmp_path / "a.mrk.json").write_text(MARKUPS % ('"LPS"', point))
+    (tmp_path / "b.json").write_text("{}")
+    wrong["b.json"] = "'markups' expected, found none"
     wrong["a.mrk.json"] = "one coordinateSystem, LPS or RAS, needed, found LPS, RAS"
     for name, words in wrong.items():
         with pytest.raises(ValueError, match=words):

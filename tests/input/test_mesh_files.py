@@ -341,6 +341,9 @@ def test_a_second_mesh_in_a_file_is_named(tmp_path):
         longer = ply(order) + (b"3 0 1 2\n" if order == "ascii" else bytes(26))
         with pytest.raises(ValueError, match=r"found \d+ more rows than the header says"):
             read_mesh(file(tmp_path, "m.ply", longer))
+    write_mesh(tmp_path / "m.vtk", X, T, x=X[:, 0])
+    with pytest.raises(ValueError, match=r"one mesh expected, found a second VTK at byte \d+"):
+        read_mesh(file(tmp_path, "m.vtk", 2 * (tmp_path / "m.vtk").read_bytes()))
     for more in ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "3 0 1 2\n"):
         with pytest.raises(ValueError, match=r"found \d more lines than its counts say"):
             read_mesh(file(tmp_path, "m.off", f"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n{more}"))
@@ -363,8 +366,12 @@ def test_text_in_utf_16_is_named(tmp_path):
         (b"NRRD0004\ntype: uchar\n", r"found a volume \(NRRD\); give a label"),
         (bytes(128) + b"DICM", "a DICOM file"),
         (b"\x89PNG\r\n\x1a\n", "a picture"),
-        (b"BZh91AY", "a compressed file"),
-        (b"<!DOCTYPE html><html>", "a web page"),
+        (b"BZh91AY", "a compressed file: unpack it"),
+        (b"<!DOCTYPE html><html>", "a web page: download the file again"),
+        (b"<!-- saved from a page -->\n<HEAD>", "a web page"),
+        (b"PXR-USDC", "a USD, "),
+        (b"\xff\xff\xfd\0\0\x08\0\0\6", "quadrangles, of FreeSurfer"),
+        (b" " * 72 + b"S      1\n", "a STEP or IGES file"),
         (b"version https://git-lfs.github.com/spec/v1\n", "a pointer of Git LFS"),
         (b"MZ\x08\0" + struct.pack("<III", 0, 100, 0), "found an overlay of values or colours"),
     ],
@@ -411,6 +418,8 @@ def test_the_name_of_an_stl_solid_is_free_text(tmp_path, name):
     for end in ("\n", "\r\n", "\r"):
         text = f"solid {name}\n{facets}endsolid {name}\n".replace("\n", end)
         same_surface(file(tmp_path, "m.stl", text))
+    with pytest.raises(ValueError, match="expected 1 endsolid at the end"):
+        read_mesh(file(tmp_path, "m.stl", f"{text}solid b\n{facets}"))
     corner, end = "   vertex {} {} {}\n".format(*X[T[0, 2]]), "  endloop\n"
     text = f"solid {name}\n{facets}endsolid\n".replace(corner + end, end, 1)
     with pytest.raises(ValueError, match="three vertices in every facet expected"):  # two and four
