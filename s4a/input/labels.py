@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -132,8 +133,23 @@ def _volume(data):
         raise ValueError(f"{needed} bytes of voxels {shape} expected, found {len(data) - n_bytes}")
     values, rounded = _whole(np.asanyarray(kind.from_bytes(data).dataobj).reshape(shape))
     unknown = "the volume has no orientation, left and right may be exchanged" * (not system.axes)
-    attrs = {"format": found, "note": "; ".join(filter(None, [unknown, rounded])), **system.attrs}
-    return values, affine, attrs
+    notes = filter(None, [unknown, _two_places(header) if name == "NIfTI" else "", rounded])
+    return values, affine, {"format": found, "note": "; ".join(notes), **system.attrs}
+
+
+def _two_places(header):
+    """Note on a NIfTI header whose sform and qform differ, unless the sform is of a template."""
+    sform, qform = header.get_sform(coded=True)[0], header.get_qform(coded=True)[0]
+    if sform is None or qform is None or int(header["sform_code"]) > 2:
+        return ""
+    corners = np.array(list(product(*((0, n - 1) for n in header.get_data_shape()[:3]), [1])))
+    apart = np.linalg.norm(corners @ (sform - qform).T, axis=1).max()
+    if apart < min(header.get_zooms()[:3]) / 2:
+        return ""
+    return (
+        f"sform and qform place the volume up to {apart:.3g} apart; the sform is used, other "
+        "programs may use the qform"
+    )
 
 
 def _whole(values):

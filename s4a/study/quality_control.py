@@ -36,8 +36,8 @@ FLAGGED = 0.06
 WRONG, UNSURE = 0.0065, 0.004
 # the same over the median of the collection, as coarse meshes raise the product for all shapes
 WRONG_RATIO, UNSURE_RATIO = 2.0, 1.5
-# modes of variation: least number of shapes; least share of a shape in the sum of squared scores,
-# its largest p value, least share of the variance
+# modes of variation: least number of shapes for near copies; least share of a shape in the sum of
+# squared scores, its largest p value, least share of the variance
 FEW, SHARE, ALONE, LARGE = 6, 0.7, 0.001, 0.3
 # near copies: largest distance over the usual one and over sqrt(area), and largest p value
 NEAR, COPY, CHANCE = 0.2, 0.005, 0.02
@@ -271,14 +271,14 @@ def check_modes(pca: xr.Dataset, area: float) -> Flags:
     flags: Flags = {}
     names, n = pca["shape"].values.tolist(), pca.sizes["shape"]
     score, ratio = pca["score"].values, pca["explained_variance_ratio"].values
-    if n < FEW:
-        return flags
     share = score**2 / (score**2).sum(0)  # (n, c)
     p = n * stats.beta.sf(share.max(0) * n / (n - 1), 0.5, (n - 2) / 2)
     for c in np.flatnonzero((share.max(0) > SHARE) & (p < ALONE) & (ratio > LARGE)):
         values = {"component": c + 1, "percent": 100 * share[:, c].max()}
         one = flag("influential", **values, mode_percent=100 * ratio[c])
         flags.setdefault(names[share[:, c].argmax()], []).append(one)
+    if n < FEW:
+        return flags
     distance = squareform(pdist(score * pca["standard_deviation"].values))
     np.fill_diagonal(distance, np.inf)
     first, second = np.sort(distance, axis=1)[:, :2].T

@@ -117,6 +117,21 @@ def test_a_volume_that_does_not_say_how_it_lies_is_named(tmp_path):
     assert "coordinate_system" not in attrs
 
 
+def test_a_volume_with_two_places_is_named(tmp_path):
+    image = nibabel.Nifti1Image(ball()[0].astype(np.uint8), np.diag([-2, 2, 2, 1]))
+    for qform, code, note in (
+        (np.diag([-2, 2, 2, 1]), 2, False),
+        (np.diag([2, 2, 2, 1]), 2, True),
+        (np.diag([2, 2, 2, 1]), 4, False),  # of a template
+    ):
+        image.set_sform(np.diag([-2, 2, 2, 1]), code)
+        image.set_qform(qform, 1)
+        image.to_filename(tmp_path / "a.nii")
+        X, _, attrs = read_volume(tmp_path / "a.nii", 1)
+        assert ("sform and qform place the volume up to" in attrs.get("note", "")) == note
+        assert X[:, 0].max() < 0
+
+
 @pytest.mark.parametrize(
     "values, label, why",
     [
