@@ -202,6 +202,7 @@ def read_shapes(
         check(name, value)
     options = {"components": components, "strict": strict, "close_holes": close_holes}
     system = {"coordinate_system": coordinate_system, "unit": unit}
+    with_system(xr.Dataset(), **system)  # an error of the options, not of each file
     label = check_label(label)
     volumes = label is not None
     meshes: dict[str, xr.Dataset] = {}

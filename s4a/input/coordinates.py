@@ -16,7 +16,7 @@ import xarray as xr
 
 from s4a.input.formats import VtkXml, freesurfer_counts
 from s4a.input.raw import xml
-from s4a.options import MILLIMETRES
+from s4a.options import MILLIMETRES, check_unit
 from s4a.schema import in_unit
 
 # RAS and LPS: world coordinates of an image, as 3D Slicer and most programs use them; surface RAS:
@@ -106,8 +106,9 @@ class CoordinateSystem:
     def title(self) -> str:
         """Title of a mesh file, from which 3D Slicer reads the axes; empty if they are unknown."""
         unit = f" UNIT={self.unit}" if self.unit else ""
-        placed = " ORIGIN=unknown" if self.origin in (UNKNOWN, SURFACE) else ""
-        return f"S4A SPACE={self.axes}{unit}{placed}" if self.axes else ""
+        is_name = self.origin != SURFACE and re.fullmatch(r"\w+", self.origin)
+        place = f" ORIGIN={self.origin if is_name else UNKNOWN}" if self.origin else ""
+        return f"S4A SPACE={self.axes}{unit}{place}" if self.axes else ""
 
     def __str__(self) -> str:
         return ", ".join(self.attrs.values()) if self.axes else f"unknown {self.unit}".strip()
@@ -238,7 +239,9 @@ def with_system(mesh: xr.Dataset, coordinate_system: str | None, unit: str | Non
     """Return a mesh with the given coordinate system and unit where its own are unknown."""
     if not (coordinate_system or unit):
         return mesh
-    given = CoordinateSystem.of({"coordinate_system": coordinate_system, "unit": unit})
+    given = CoordinateSystem.of(
+        {"coordinate_system": coordinate_system, "unit": check_unit(unit) if unit else ""}
+    )
     return mesh.assign_attrs(CoordinateSystem.of(mesh.attrs).filled(given).attrs)
 
 
@@ -304,9 +307,10 @@ def system_in(data: bytes, kind: str) -> CoordinateSystem:
     if kind == "VTP" and not space and b"SPACE" in data:
         axes = next(iter(VtkXml(data).strings("SPACE")), "")
     axes = axes if axes in AXES else ""
-    origin = UNKNOWN if b" ORIGIN=unknown" in head else ""
+    origin = re.search(rb" ORIGIN=(\w+)", head)
     default = "mm" if axes and b"S4A SPACE" not in head else ""
-    return CoordinateSystem(axes, origin, unit[1].decode() if unit else default)
+    place = origin[1].decode() if origin and axes else ""
+    return CoordinateSystem(axes, place, unit[1].decode() if unit else default)
 
 
 def _of_freesurfer(data):

@@ -894,15 +894,18 @@ def _off_bytes(X, T, _, title=""):
 def _stl_bytes(X, T, _, title=""):
     rows = np.zeros(len(T), _STL_TRIANGLE)
     rows["corner"] = X[T]
-    return f"binary {title}".encode().ljust(80) + len(T).to_bytes(4, "little") + rows.tobytes()
+    return f"binary {title}".encode().ljust(80)[:80] + len(T).to_bytes(4, "little") + rows.tobytes()
+
+
+_GIFTI_SPACES = {None: 2, "scanner": 1, "Talairach": 3, "MNI152": 4}  # codes by origin
 
 
 def _gifti_bytes(X, T, scalars, title=""):
     from nibabel.gifti import gifti  # imported here only
 
-    space = gifti.GiftiCoordSystem(
-        *[2 if "SPACE=RAS" in title and "ORIGIN" not in title else 0] * 2
-    )
+    found = re.search(r"SPACE=RAS.*?(?: ORIGIN=(\w+)|$)", title)
+    code = _GIFTI_SPACES.get(found[1], 0) if found else 0
+    space = gifti.GiftiCoordSystem(code, code)
     arrays = [("POINTSET", X.astype(np.float32), {}), ("TRIANGLE", T, {})]
     for name, values in scalars.items():
         arrays.append(("SHAPE", values.astype(np.float32), {"Name": name}))

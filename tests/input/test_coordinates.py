@@ -320,6 +320,16 @@ def test_a_written_mesh_lies_where_the_scan_has_it(tmp_path):
             assert volume(scan, S) == pytest.approx(volume(X, T), rel=1e-5), (text, end)
         image = nib.load(tmp_path / "a.gii")
         assert image.agg_data("pointset") == pytest.approx(X, abs=1e-4)
+    for text in ("RAS", "scanner RAS", "MNI152 RAS", "RAS, origin unknown"):  # the origin is kept
+        for end in ("ply", "stl", "vtp", "gii"):
+            write_mesh(tmp_path / f"a.{end}", X, T, coordinate_system=text, unit="mm")
+            assert read_mesh(tmp_path / f"a.{end}")[2]["coordinate_system"] == text, end
+
+
+def test_an_unknown_unit_or_system_is_an_error_of_the_options():
+    for given in ({"unit": "inch"}, {"coordinate_system": "tkRAS"}):
+        with pytest.raises(ValueError, match=r"^(unit must be one of|one coordinate system of)"):
+            read_shapes({"a": (X, T)}, **given)
 
 
 def test_written_markups_lie_where_the_scan_has_them(tmp_path):
