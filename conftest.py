@@ -18,6 +18,9 @@ from s4a import analyse, coarsen, open_study, spectrum, synthetic
 # study. Tests of several processes give their number
 os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
 
+# what a test reads, the system has, before it is on the disk
+os.fsync = lambda handle: None
+
 
 @pytest.fixture(scope="session")
 def example_study():
