@@ -8,6 +8,7 @@ write to temporary folders is gone afterwards.
 import os
 import tempfile
 
+import numpy as np
 import pytest
 from small import OPTIONS
 
@@ -98,6 +99,15 @@ def short_films(monkeypatch):
     """Commands write films of two small pictures; long ones have tests of their own."""
     film = s4a.write_film
     monkeypatch.setattr(s4a, "write_film", lambda *what: film(*what, n_frames=2, width=100))
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Pages have pictures of a few pixels; those that are looked at have tests of their own."""
+    from s4a.show import page, pictures
+
+    for module in (page, pictures):
+        monkeypatch.setattr(module, "render", lambda *a, **options: np.zeros((2, 2, 4), np.uint8))
 
 
 def pytest_terminal_summary(terminalreporter):

@@ -298,7 +298,7 @@ def test_a_compressed_file_that_is_cut_or_damaged_is_refused(tmp_path):
 
 
 def memory_of_refusal(path, message):
-    """Most memory in bytes while a mesh is refused; that of other threads is in it, now and then."""
+    """Most memory (bytes) while a mesh is refused; now and then other threads take some, too."""
     tracemalloc.start()
     try:
         with pytest.raises(ValueError, match=message):
