@@ -131,17 +131,11 @@ def pytest_terminal_summary(terminalreporter):
 
 
 # files that take long begin first, the longest before all, so that no worker waits for the other
-SLOW = ["notebooks", "browser", "site", "interruptions", "several", "complete", "panels_browser"]
-SLOW += [
-    "faults",
-    "widgets",
-    "scenes_browser",
-    "pages",
-    "release",
-    "growth",
-    "save_browser",
-    "kills",
-]
+SLOW = """
+notebooks browser site interruptions several pages complete properties widgets faults panels_browser
+pipeline scenes_browser quality_control study_files insert reflect leave_one_out cluster clean
+scalable_study landmarks labels asymmetry view subjects plausibility save_browser kills release
+""".split()
 
 
 def pytest_collection_modifyitems(items):
