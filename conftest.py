@@ -6,6 +6,7 @@ write to temporary folders is gone afterwards.
 """
 
 import os
+import sys
 import tempfile
 
 import numpy as np
@@ -19,6 +20,8 @@ from s4a import analyse, coarsen, open_study, spectrum, synthetic
 # study. Tests of several processes give their number
 os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
 
+# jsonschema, of nbformat, would make the grammar of addresses of it, for a second in every worker
+sys.modules["rfc3987_syntax"] = None
 # what a test reads, the system has, before it is on the disk
 os.fsync = lambda handle: None
 
