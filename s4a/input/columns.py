@@ -1,35 +1,32 @@
-"""Check of the columns of a table (6.1): codes of missing values, outliers, names that look alike.
+"""Check of the columns of a table (6.1): missing-value codes, outliers, names that look alike.
 
-Values are reported and never changed.  A test is refused where it would be meaningless.
+Values are reported and never changed.  A test is refused if it would be meaningless.
 """
 
 import logging
 import re
-import unicodedata
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.special import stdtr
 
-from s4a.input.files import visible
-from s4a.input.subjects import is_plain_number, listed
+from s4a.input.subjects import is_plain_number, listed, look_alikes
 
 log = logging.getLogger(__name__)
 
-# -9, 99, -999, 9998 and alike, and the largest integers of 16 and 32 bits
+# -9, 99, -999, 9998 and similar, and the largest integers of 16 and 32 bits
 _CODES = re.compile(r"-1|-?(9*[789]|77+|88+|32768|2147483648)|32767|65535|2147483647")
-_WORDS = re.compile(r"[?.]+|unknown|missing|not available|n\.a\.|n\.?d\.?|#.*[!?]", re.IGNORECASE)
-_LEVEL, _SLIP_LEVEL = 3e-4, 0.04  # of an outlier in a column; of a value ten times the others
-# Cyrillic and Greek letters and dashes that look like Latin letters and the hyphen
-_SAME = str.maketrans(
-    "аеорсухіѕјкмнтвΑΒΕΖΗΙΚΜΝΟΡΤΥΧαοινρυχ‐‑‒–—−", "aeopcyxisjkmhtbABEZHIKMNOPTYXaoivpux------"
+_WORDS = re.compile(
+    r"[?.]+|none|unknown|missing|not? (available|data)|n\.a\.|n\.?d\.?|#.*[!?]", re.IGNORECASE
 )
+_ALONE = 0.995  # share of the variance of a column that an outlier may have
+_LEVEL, _SLIP_LEVEL = 3e-4, 0.04  # of an outlier in a column; of a value ten times the others
 
 
 def check_column(
     values: np.ndarray, names: Sequence[str], what: str, *, categories: bool = False
 ) -> None:
-    """Check a column before a test: codes of missing values, outliers, names that look alike.
+    """Check a column before a test: missing-value codes, outliers, names that look alike.
 
     Parameters
     ----------
@@ -45,8 +42,8 @@ def check_column(
     Raises
     ------
     ValueError
-        If a value is certainly a code of a missing value, or two names differ only in characters
-        that cannot be seen.  Other findings are warnings.
+        If a value is certainly a missing-value code, one shape has almost the whole variance of the
+        column, or two names differ only in invisible characters.  Other findings are warnings.
 
     Examples
     --------
@@ -77,10 +74,10 @@ def _check_names(cells, names, what):
         text = f"{what}: {' and '.join(f'{cell!a} ({name})' for cell, name in example.items())} "
         if same:
             raise ValueError(
-                f"{text}look alike, and differ only in how their characters are stored, or in ones "
-                "that cannot be seen: write the same name for the same group"
+                f"{text}look alike, and differ only in encoding or invisible characters: write the "
+                "same name for the same group"
             )
-        log.warning("%sdiffer only in case or form: are these different groups?", text)
+        log.warning("%sdiffer only in case or similar letters: are these different groups?", text)
 
 
 def _check_numbers(x, names, what):
@@ -95,19 +92,21 @@ def _check_numbers(x, names, what):
     far = rest.copy()
     far[rest] = outlying(x[rest])
     if far.any():
-        rest = x[rest & ~far]
-        log.warning(
-            "%s: outliers, %s (others %.10g to %.10g): correct the value, or write NA, if it is "
-            "wrong; the test uses it",
-            what,
-            listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(far)]),
-            rest.min(),
-            rest.max(),
-        )
+        found = listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(far)])
+        low, high = min(x[rest & ~far]), max(x[rest & ~far])
+        text = f"{what}: outliers, {found} (others {low:.10g} to {high:.10g})"
+        remaining = np.delete(x[rest], abs(x[rest] - np.median(x[rest])).argmax())
+        share = 1 - remaining.var() * len(remaining) / (x[rest].var() * rest.sum())
+        if share > _ALONE:
+            raise ValueError(
+                f"{text}: {share:.1%} of the variance is of one shape, so a test would "
+                "compare it with all others: correct the value, or write NA"
+            )
+        log.warning("%s: correct the value, or write NA, if it is wrong; the test uses it", text)
 
 
 def _report_codes(codes, cells, names, what, others):
-    """Warn about codes of missing values, or ValueError if one is certain."""
+    """Warn about missing-value codes; ValueError if one is certain."""
     found = listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(codes)])
     if not found:
         return
@@ -122,7 +121,7 @@ def _report_codes(codes, cells, names, what, others):
 
 
 def missing_codes(x: np.ndarray) -> np.ndarray:
-    """Return a mask of numbers ``(n,)`` that are a usual code of missing values, and outlying.
+    """Return a mask of numbers ``(n,)`` that are usual missing-value codes, and outlying.
 
     Examples
     --------
@@ -144,12 +143,12 @@ def missing_codes(x: np.ndarray) -> np.ndarray:
 
 
 def _usual(x):
-    """Mask of the numbers that are usual codes."""
+    """Return a mask of the numbers that are usual codes."""
     return np.array([bool(_CODES.fullmatch(f"{value:.15g}")) for value in x])
 
 
 def _is_code(code, rest, count):
-    """Whether a usual code is one among the other values of its column, as it is far from them."""
+    """Return whether a usual code is far enough from the other values of its column to be one."""
     if abs(code) < 10 and rest.min() < 0:
         return False  # of differences
     low, high, decimals = rest.min(), rest.max(), (rest % 1 != 0).mean()
@@ -217,36 +216,3 @@ def _p_value(value, rest):
 def _p_of_new(value, rest, step):
     deviation = np.hypot(rest.std(ddof=1), step) * np.sqrt(1 + 1 / len(rest))
     return 2 * stdtr(len(rest) - 1, -abs(value - rest.mean()) / deviation)
-
-
-def look_alikes(cells: Sequence[str]) -> list[tuple[bool, list[str]]]:
-    """Return different texts that look alike, and whether they cannot be distinguished by eye.
-
-    Examples
-    --------
-    >>> from s4a.input.columns import look_alikes
-    >>> look_alikes(["a", "A", "b", "b\\u200b"])
-    [(False, ['A', 'a']), (True, ['b', 'b\\u200b'])]
-    """
-    found = []
-    by_look: dict[str, list[str]] = {}
-    for cell in sorted({*cells}):
-        by_look.setdefault(look(cell), []).append(cell)
-    for variants in by_look.values():
-        if len(variants) > 1:
-            found.append((len({*map(visible, variants)}) < len(variants), variants))
-    return found
-
-
-def look(text: str) -> str:
-    """Return what texts that look alike have in common: compatible letters in lower case.
-
-    Examples
-    --------
-    >>> from s4a.input.columns import look
-    >>> look(" Site\\u00a01 ") == look("site 1"), look("01") == look("1.0")
-    (True, True)
-    """
-    text = unicodedata.normalize("NFKC", visible(text).translate(_SAME))
-    text = unicodedata.normalize("NFKC", text.casefold().translate(_SAME))
-    return str(float(text)) if is_plain_number(text) else text

@@ -12,7 +12,15 @@ from scipy import stats
 from scipy.spatial.distance import pdist, squareform
 
 from s4a.geometry.crossing import can_count
-from s4a.input.plausibility import Flag, Flags, find_warnings, flag, flagged_lines, pick_references
+from s4a.input.plausibility import (
+    Flag,
+    Flags,
+    find_warnings,
+    flag,
+    flagged_lines,
+    in_words,
+    pick_references,
+)
 from s4a.options import Options
 from s4a.schema import POSE
 from s4a.study.netcdf import arrays, attributes, open_file, read
@@ -152,7 +160,7 @@ def exclude_flagged(
 
 
 def flag_poses(run: Run, aligned: Iterable[str], flags: Flags) -> Flags:
-    """Add flags to the shapes that fit the others alike in several poses."""
+    """Add flags to the shapes whose pose is ambiguous."""
     found = {n: attributes(run.folder / f"network/alignment_{n}.nc")["ambiguity"] for n in aligned}
     new = {name: [Flag(POSE, words, True)] for name, words in found.items() if words}
     return flags | {name: [*flags.get(name, []), *new[name]] for name in new}
@@ -177,9 +185,9 @@ def exclude_ambiguous(
     excluded = {n: coarse[n] for n in ambiguous if n != options.template}
     if 2 * len(excluded) >= len(coarse):
         remark = (
-            f"{len(ambiguous)} of {len(coarse)} shapes fit the others alike in several poses, too "
-            "many to exclude them; all are used, some perhaps in the wrong pose: give landmarks=, "
-            "or alignment='given' if the files are aligned"
+            f"{len(ambiguous)} of {len(coarse)} shapes fit the others equally well in several "
+            "poses, too many to exclude; all are used, some perhaps in the wrong pose: give "
+            "landmarks=, or alignment='given' if the files are aligned"
         )
         return flags, coarse, {}, [remark]
     return flags, {n: coarse[n] for n in coarse if n not in excluded}, excluded, []
@@ -233,7 +241,7 @@ def check_registrations(run: Run, registered: Keys, inserted: Keys) -> tuple[Fla
 
 
 def check_modes(pca: xr.Dataset, area: float) -> Flags:
-    """Warn about shapes that make a mode of variation alone, and about near copies.
+    """Warn about shapes that dominate a mode of variation, and about near copies.
 
     Parameters
     ----------
@@ -286,8 +294,50 @@ def check_modes(pca: xr.Dataset, area: float) -> Flags:
     return flags
 
 
+def check_pair(score: float, distortion: float, n: int, options: Options) -> dict[str, str]:
+    """Return status and warning of a single registration, by the limits of :func:`flagged`.
+
+    There is no collection to compare with.  On coarse meshes correct registrations score up to
+    1.2 times the vertex spacing 1 / sqrt(n), so those below twice the spacing are not flagged.
+
+    Parameters
+    ----------
+    score, distortion : float
+        Registration error score, and mean |distortion|.
+    n : int
+        Number of vertices of the coarser surface.
+    options : Options
+        With ``quality_control="off"`` the status is always "ok".
+
+    Returns
+    -------
+    dict
+        ``status``, "ok" or "flagged", and ``warning``, empty if nothing was found.
+
+    Examples
+    --------
+    >>> from s4a.options import Options
+    >>> from s4a.study.quality_control import check_pair
+    >>> check_pair(0.036, 0.4, 6890, Options())["status"]
+    'flagged'
+    >>> check_pair(0.078, 0.17, 200, Options())
+    {'status': 'ok', 'warning': ''}
+    """
+    found: Flags = {}
+    if score > WRONG_RATIO / np.sqrt(n):
+        found, _ = flagged({"pair": score}, {"pair": distortion}, usual=0.0)
+    found = unflagged(found) if options.quality_control == "off" else found
+    is_flagged = any(one.flagged for one in found.get("pair", []))
+    return {
+        "status": "flagged" if is_flagged else "ok",
+        "warning": in_words(found.get("pair", [])),
+    }
+
+
 def flagged(
-    registration_error: dict[str, float], distortion: dict[str, float] | None = None
+    registration_error: dict[str, float],
+    distortion: dict[str, float] | None = None,
+    usual: float | None = None,
 ) -> tuple[Flags, list[str]]:
     """Flag shapes by their registration error, alone and times distortion.
 
@@ -298,6 +348,8 @@ def flagged(
     distortion : dict of str to float, optional
         Mean |distortion|.  A wrong map misses the surface and distorts, so the product separates
         better than either number.
+    usual : float, optional
+        Product of a usual registration; by default the median.
 
     Returns
     -------
@@ -317,7 +369,8 @@ def flagged(
     product = {
         name: score * distortion.get(name, 0.0) for name, score in registration_error.items()
     }
-    usual = float(np.median([value for value in product.values() if value > 0] or [0.0]))
+    if usual is None:
+        usual = float(np.median([value for value in product.values() if value > 0] or [0.0]))
     limit, warning_limit = max(WRONG, WRONG_RATIO * usual), max(UNSURE, UNSURE_RATIO * usual)
     wrong = {
         n: score for n, score in registration_error.items() if score > FLAGGED or product[n] > limit

@@ -240,7 +240,7 @@ def test_a_shape_that_makes_a_mode_alone_and_a_near_copy_are_named():
         large[2] += 1.0
         (one,) = check_modes(modes_of(large), 1.0)["s2"]
         assert (one.kind, one.flagged) == ("influential", False)
-        assert one.words.startswith("makes mode 1 almost alone: ")
+        assert one.words.startswith("dominates mode 1: ")
         copy[5] = copy[1] + 5e-4 * rng.normal(size=12)
         assert [*check_modes(modes_of(copy), 1.0)] == ["s1"]
         assert "nearly the same shape as s5" in check_modes(modes_of(copy), 1.0)["s1"][0].words
@@ -251,7 +251,7 @@ def test_a_shape_that_makes_a_mode_alone_is_in_the_summary(study):
     kinds = ["influential" if name == "brain_01" else "" for name in report["shape"].values]
     other = study.copy()
     other["report"] = xr.DataTree(report.assign(warning_kinds=("shape", kinds)))
-    assert "1 influential  brain_01  -> it makes a mode" in tables.run_summary(other)
+    assert "1 influential  brain_01  -> it dominates a mode" in tables.run_summary(other)
 
 
 def test_at_most_one_in_a_hundred_clean_collections_has_a_warning_of_its_modes():
