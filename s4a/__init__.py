@@ -20,7 +20,8 @@ pictures, films           :func:`write_picture`, :func:`write_film`
 new shapes                :func:`insert`
 6.1 statistics            :mod:`s4a.statistics`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`,
-                          :func:`transfer_scalars`, :func:`register_pairs`
+                          :func:`transfer_scalars`, :func:`register_pairs`,
+                          :func:`correspondence`
 for other programs        :func:`write_registered`, :func:`write_label_volumes`
 the bundled collection    :mod:`s4a.synthetic`
 ========================  ====================================================================

@@ -12,6 +12,7 @@ from . import widgets as widgets
 from .accessor import explore as explore
 from .analysis import statistics as statistics
 from .analysis.export import write_registered as write_registered
+from .analysis.transfer import correspondence as correspondence
 from .analysis.transfer import register_pairs as register_pairs
 from .analysis.transfer import transfer_labels as transfer_labels
 from .analysis.transfer import transfer_landmarks as transfer_landmarks

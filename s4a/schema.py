@@ -189,6 +189,9 @@ label_vote | vertex label_value | 1 | share of the votes for each label; rows su
 field | vertex | 1 | scalar field
 landmark_triangle | landmark | 1 | triangle of the mesh that contains the landmark
 landmark_barycentric | landmark corner | 1 | barycentric weights of the landmark in that triangle
+image_triangle | vertex | 1 | triangle of another shape that contains the image of the vertex
+image_barycentric | vertex corner | 1 | barycentric weights of the image in that triangle
+image_position | vertex xyz | L | image of the vertex on another shape
 landmark_confidence | landmark | 1 | confidence of the match at the landmark, 0 to 1
 landmark_distance | landmark | L | distance of the given landmark from its surface
 landmark_disagreement | landmark | L | distance between the positions from different paths of

@@ -34,12 +34,12 @@ from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas, vertex_normals
 from s4a.input.collection import Mesh, as_meshes
 from s4a.input.coordinates import CoordinateSystem
 from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, as_landmarks, locate, trace_curves
-from s4a.method.register import identity, uncertainty
+from s4a.method.register import common_unit, identity, uncertainty
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
-from s4a.schema import check_type, dataset, require
-from s4a.study.pair import match_shapes, shape_of
+from s4a.schema import check_type, dataset, in_unit, require
+from s4a.study.pair import log_warning, match_shapes, shape_of
 from s4a.study.processes import workers
 from s4a.study.tree import stack_registration, template_mesh
 
@@ -289,7 +289,9 @@ def register_pairs(
         A study with the nodes
 
         - ``/original``: meshes of the template and of the shapes;
-        - ``/registration``: registration of each shape to the template;
+        - ``/registration``: registration of each shape to the template; the attributes ``status``
+          and ``warning`` of ``/registration/NAME`` flag registrations that are probably wrong, as
+          in :func:`s4a.match_pair`;
         - ``/reverse``: registration of the template to each shape, with `bidirectional`.
 
     Raises
@@ -331,6 +333,10 @@ def register_pairs(
         if settings.bidirectional
         else {}
     )
+    for n, registration in forth.items():
+        log_warning(registration, n)
+        if n in back:
+            log_warning(back[n], f"{n} in reverse")
     study = _study_of(name, meshes.pop(name), meshes, forth, back)
     study["registration"].attrs["preset"] = settings.preset or ""
     return study
@@ -388,6 +394,7 @@ def _routes_from_outside(
         inside = _shape_of(template, options)
     outside = _shape_of(mesh, options)
     forth, back = _match_both(inside, outside, options)
+    log_warning(forth, f"the registration of {name!r} to the external source")
     routes: list[Route] = [[(link(mesh, template, forth), "down")]]
     if back is not None:
         routes.append([(link(template, mesh, back), "up")])
@@ -675,7 +682,9 @@ def transfer_landmarks(
           coordinates of its mesh;
         - ``landmark_triangle(landmark)`` and ``landmark_barycentric(landmark, corner)``: triangle
           and barycentric coordinates of these points;
-        - ``landmark_confidence(landmark)``: confidence of the match, from 0 to 1;
+        - ``landmark_confidence(landmark)``: confidence of the match, from 0 to 1.  It finds failed
+          regions of shapes in different poses; among shapes in similar poses it is an average of
+          the group and does not rank the points by their error;
         - ``landmark_disagreement(landmark)``, if several matches are averaged: largest distance of
           one of their results from the mean;
         - ``landmark_curve`` and ``landmark_closed``, with curves: name of the curve of each point,
@@ -730,24 +739,91 @@ def transfer_landmarks(
     return xr.DataTree.from_dict(transferred)
 
 
+def correspondence(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
+    """Return the point of one shape for every vertex of another, through the template (4.2, 6.2).
+
+    Two registered surfaces are composed, without rounding to vertices of the template or of the
+    target: from the vertex to the closest point of the template registered to the source, and from
+    that point of the template registered to the target to the closest point of the target.
+
+    Parameters
+    ----------
+    study : DataTree
+        A finished study, or a result of :func:`register_pairs` or :func:`pair_study`.
+    source, target : str
+        Names of two shapes of the study; either may be the template.
+
+    Returns
+    -------
+    Dataset
+        The variables are
+
+        - ``image_triangle(vertex)`` and ``image_barycentric(vertex, corner)``: triangle of the
+          target and barycentric weights for each vertex of the source;
+        - ``image_position(vertex, xyz)``: the point, in the coordinates of the target;
+        - ``confidence(vertex)``: confidence of the match, from 0 to 1.
+
+    Raises
+    ------
+    ValueError
+        If the study has no registration, or a shape is not in it.
+
+    See Also
+    --------
+    s4a.transfer_labels, s4a.transfer_scalars, s4a.transfer_landmarks : Values along this map.
+    s4a.latent_match : Vertices that correspond by the latent bases alone.
+
+    Examples
+    --------
+    >>> import s4a
+    >>> study = s4a.synthetic.example_study()
+    >>> found = s4a.correspondence(study, "brain_01", "brain_02")
+    >>> found["image_position"].shape, bool((found["image_barycentric"].sum("corner") > 0.99).all())
+    ((200, 3), True)
+    """
+    mesh, routes_to_targets = plan(study, source, [target])
+    _, shape, routes = next(routes_to_targets)
+    vertices = identity(Shape(mesh))
+    points = vertices["template_triangle"].values, vertices["template_barycentric"].values
+    position, (triangle, weights), confidence, _ = _blend_points(points, shape, routes)
+    image = dataset(
+        image_triangle=triangle.astype(np.int32),
+        image_barycentric=weights,
+        image_position=position,
+        confidence=confidence.mean(0).astype(np.float32),
+    )
+    return in_unit(image, common_unit(shape)).assign_attrs(source=source, target=target)
+
+
 def _transfer_landmarks(marked, target, routes):
     """Mean of the landmarks of all routes, weighted by confidence, on the surface."""
-    X, T = as_arrays(target)
     points = marked["landmark_triangle"].values, marked["landmark_barycentric"].values
-    results = [transfer_along(route, *points) for route in routes]
-    confidence = np.stack([result[2] for result in results])  # (routes, p)
-    triangle, weights, _ = results[0]
-    disagreement = {}
-    if len(results) > 1:
-        positions = np.stack([interpolate(X, T, t, w) for t, w, _ in results])  # (routes, p, 3)
-        share = confidence + 1e-9
-        mean = np.einsum("rp,rpx->px", share, positions) / share.sum(0)[:, None]
-        triangle, weights = closest_point(mean, X, T)
-        disagreement["landmark_disagreement"] = np.linalg.norm(positions - mean, axis=2).max(0)
+    position, (triangle, weights), confidence, distance = _blend_points(points, target, routes)
+    disagreement = {} if distance is None else {"landmark_disagreement": distance}
     return dataset(
-        landmark_position=interpolate(X, T, triangle, weights),
+        landmark_position=position,
         landmark_triangle=triangle.astype(np.int32),
         landmark_barycentric=weights,
         landmark_confidence=confidence.mean(0),
         **disagreement,
     )
+
+
+def _blend_points(points, target, routes):
+    """Mean of points along all routes, weighted by confidence, on the surface of the target.
+
+    Position ``(p, 3)``, triangle and weights, confidences ``(routes, p)``, and the largest distance
+    of a route from the mean ``(p,)``, None for one route.
+    """
+    X, T = as_arrays(target)
+    results = [transfer_along(route, *points) for route in routes]
+    confidence = np.stack([result[2] for result in results])  # (routes, p)
+    on_surface = results[0][:2]
+    distance = None
+    if len(results) > 1:
+        positions = np.stack([interpolate(X, T, t, w) for t, w, _ in results])  # (routes, p, 3)
+        share = confidence + 1e-9
+        mean = np.einsum("rp,rpx->px", share, positions) / share.sum(0)[:, None]
+        on_surface = closest_point(mean, X, T)
+        distance = np.linalg.norm(positions - mean, axis=2).max(0)
+    return interpolate(X, T, *on_surface), on_surface, confidence, distance

@@ -62,7 +62,7 @@ def doctor(folder: str = ".") -> int:
 def exit_code(statuses: "list[Any]", fail_on: str, otherwise: int) -> int:
     """Return 3 if a shape has the status that --fail-on names, or is excluded with "flagged"."""
     failed = {"none": [], "excluded": ["excluded"], "flagged": ["flagged", "excluded"]}[fail_on]
-    return 3 if any(status.isin(failed).any() for status in statuses) else otherwise
+    return 3 if any(np.isin(status, failed).any() for status in statuses) else otherwise
 
 
 def run(
@@ -406,6 +406,7 @@ def transfer(
     source_landmarks: str | None = None,
     out: str,
     blur: float | None = None,
+    fail_on: Literal["none", "excluded", "flagged"] = "none",
     n_jobs: int,
     **options: Any,
 ) -> int:
@@ -428,6 +429,8 @@ def transfer(
     blur : X
         smooth the votes for labels over this multiple of the estimated match error; 0: not at all
         (default: 1; 0 with --preset paper)
+    fail_on
+        end with exit code 3 if targets are excluded, or if targets are flagged or excluded
     """
     if not (labels or source_landmarks):
         raise ValueError("nothing to transfer: give --labels FILE, --source-landmarks FILE or both")
@@ -459,8 +462,13 @@ def transfer(
         carried["labels"] = s4a.transfer_labels(study, label, blur=blur, **given)
     if points is not None:
         carried["landmarks"] = s4a.transfer_landmarks(study, points, **given)
-    write(tables.table(transferred_rows(study, carried, folder), tables.TRANSFERRED))
-    return 1 if excluded else 0
+    rows = transferred_rows(study, carried, folder)
+    registered = {n: node.attrs for n, node in study["registration"].children.items()}
+    warned = {n: attrs for n, attrs in registered.items() if attrs.get("warning")}
+    lines = (f"{n} {attrs['status']}: {attrs['warning']}" for n, attrs in warned.items())
+    write(tables.table(rows, tables.TRANSFERRED), *lines)
+    statuses = [attrs["status"] for attrs in warned.values()] + ["excluded"] * len(excluded)
+    return exit_code([statuses], fail_on, 1 if excluded else 0)
 
 
 def registered_pairs(

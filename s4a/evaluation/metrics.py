@@ -459,6 +459,8 @@ def evaluate(
         Matched vertex of the source for each vertex of the target.
     image : float array_like (n_target, 3), optional
         Positions on the source, in its frame and unit; by default those of the matched vertices.
+        For two shapes of a study, ``image_position`` of
+        ``s4a.correspondence(study, target, source)``.
     reverse : int array_like (n_source,), optional
         Match in the other direction.
     truth : array_like, optional

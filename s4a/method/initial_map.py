@@ -30,7 +30,12 @@ N_PAIRED = 8  # number of best pairings
 _CURVATURE = 3.0  # weight of mean curvature relative to a signature
 _CURVATURE_WEIGHT = 0.3  # of the curvature difference in the score of a search
 SHORT = 60  # functions of the short ZoomOut before a map is scored
-_MAX_SCORE = 0.07  # at which the search ends; wrong maps between bodies score 0.11 or more
+# scores at which the search ends: of any map, or of the best if two others agree with it.  Wrong
+# maps between bodies score 0.11 or more
+_MAX_SCORE, _MAX_AGREED = 0.07, 0.1
+# mean distances of the matches of maps that agree, and of maps that differ, of sqrt(area)
+_AGREE, _DIFFER = 0.03, 0.1
+_N_REFINED, _MARGIN = 4, 1.25  # of maps that are refined: number, largest score over the least
 
 
 class _InitialMap(NamedTuple):
@@ -52,6 +57,14 @@ class _InitialMap(NamedTuple):
         F, G = (values.astype(np.float32) for values in self.descriptors)
         descriptors = {"descriptor_of_source": F, "descriptor_of_target": G}
         return dataset(None, **energies, **(descriptors if keep_descriptors else {}))
+
+
+class _Scored(NamedTuple):
+    """Candidate of a search: score, matched points ``(n_target, 3)``, and name, map and fit."""
+
+    score: float
+    X: Array
+    candidate: tuple[str, Array, Array]
 
 
 def nearest_after_alignment(source: Basis, target: Basis, transform: RigidTransform) -> Array:
@@ -167,7 +180,9 @@ def best_initial_map(
         The same before the step of ZoomOut; C by default.
     search : bool
         Whether to continue with :func:`paired_extremities` and :data:`SEARCHED` until the first two
-        terms of a score are below ``_MAX_SCORE``.
+        terms of a score are below 0.07, or below 0.1 and two other maps agree with the best.  If
+        none is, up to four maps that differ are refined by ZoomOut and piecewise rigid iterations
+        with all functions, and the one with the lowest registration score is returned.
 
     Returns
     -------
@@ -181,7 +196,7 @@ def best_initial_map(
     maps = [("icp", C, C if fitted is None else fitted)]
     maps += _map_from_landmarks(source, target, len(C))
     best = np.inf
-    scored = []  # score, name, map, fit
+    scored: list[_Scored] = []
     for candidate in itertools.chain(maps, maps_from_signatures(source, target, len(C), search)):
         match = fmap.zoomout(source, target, candidate[1], k, step=10)[1]
         match, warp = spectral_icp.coarse_spectral_icp(
@@ -193,10 +208,38 @@ def best_initial_map(
         best = min(best, score)
         if search:
             score += _CURVATURE_WEIGHT * fmap.curvature_difference(source, target, match)
-        scored.append((score, *candidate))
-        if len(scored) >= 2 + len(maps) and best < _MAX_SCORE:
-            break
-    return min(scored, key=lambda row: row[0])[1:]
+        scored.append(_Scored(score, source.X[match], candidate))
+        scored.sort(key=lambda row: row.score)
+        n_agreed = sum(_distance(row, scored[0], target) < _AGREE for row in scored)
+        if len(scored) >= 2 + len(maps) and best < (_MAX_AGREED if n_agreed > 2 else _MAX_SCORE):
+            return scored[0].candidate
+    leaders = _leaders(scored, target) if search else scored[:1]
+    if len(leaders) > 1:
+        leaders.sort(key=lambda row: _refined_score(source, target, row.candidate[1]))
+    return leaders[0].candidate
+
+
+def _distance(one, other, target):
+    """Mean distance of two matches."""
+    return np.linalg.norm(one.X - other.X, axis=1) @ target.area
+
+
+def _leaders(scored, target):
+    """Best of the sorted candidates that differ from each other."""
+    leaders: list[_Scored] = []
+    for row in scored:
+        differs = all(_distance(row, other, target) > _DIFFER for other in leaders)
+        if differs and row.score < _MARGIN * scored[0].score:
+            leaders.append(row)
+    return leaders[:_N_REFINED]
+
+
+def _refined_score(source, target, C):
+    """Registration score after ZoomOut and piecewise rigid iterations with all functions."""
+    match = fmap.zoomout(source, target, C, min(source.k, target.k))[1]
+    return spectral_icp.scored(
+        source, target, *spectral_icp.piecewise_spectral_icp(source, target, match)
+    ).score
 
 
 def _map_from_landmarks(source, target, k):

@@ -380,7 +380,8 @@ def _confidence(study, camera):
             caption = f"{text}, from 0 to {limit:.2g}; mean over the shapes"
             figures.append(painted(caption, X, value, limit))
     note = "Mean confidence on the template, the two shapes with the lowest confidence, and the "
-    note += "distortion by the registration."
+    note += "distortion by the registration. Among shapes in similar poses the confidence is an "
+    note += "average of the group and does not rank the points by their error."
     bar = charts.color_bar("viridis", 0, 1, "confidence")
     return PARTS.note(note) + PARTS.grid(figures) + PARTS.drawing(bar, "colour bar")
 

@@ -16,6 +16,7 @@ from s4a.method.register import refine_at_full_resolution, register
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
 from s4a.schema import dataset
+from s4a.study.quality_control import check_pair
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +75,8 @@ def match_pair(
         - ``score``: registration score, lower is better
           (:func:`s4a.method.spectral_icp.registration_score`);
         - ``initialisation``: name of the initialisation with the best score;
+        - ``status`` and ``warning``: "flagged" if the registration is probably wrong, else "ok",
+          and the reason (:func:`s4a.study.quality_control.check_pair`); a warning is also logged;
         - ``initial_map``: method of the initial map, "landmarks", "dense", "icp", "hks" or "wks";
         - ``note``: the reduced k, if k was reduced.
 
@@ -125,6 +128,7 @@ def match_pair(
         note = f"k = {settings.k} reduced to {least}, the eigenfunctions that the smaller mesh has"
         registration.attrs["note"] = note
         log.warning("%s", note)
+    log_warning(registration, "the pair")
     maps["match"] = registration["registered_match"].variable
     return maps.merge(registration.drop_vars("registered_match")).assign_attrs(registration.attrs)
 
@@ -187,4 +191,15 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
         )
         maps = maps.merge(iterations)
     attrs = {"initial_map": initial.name, "ambiguity": aligned.ambiguity}
+    distortion = float(np.abs(registration["distortion"].values).mean())
+    n = min(len(source.full.X), len(target.full.X))
+    attrs |= check_pair(registration.attrs["score"], distortion, n, options)
     return registration.assign_attrs(attrs), maps
+
+
+def log_warning(registration: xr.Dataset, name: str) -> None:
+    """Log the warning of a registration of :func:`match_shapes`, if it has one."""
+    if registration.attrs["warning"]:
+        log.warning(
+            "%s is %s: %s", name, registration.attrs["status"], registration.attrs["warning"]
+        )

@@ -12,7 +12,15 @@ from scipy import stats
 from scipy.spatial.distance import pdist, squareform
 
 from s4a.geometry.crossing import can_count
-from s4a.input.plausibility import Flag, Flags, find_warnings, flag, flagged_lines, pick_references
+from s4a.input.plausibility import (
+    Flag,
+    Flags,
+    find_warnings,
+    flag,
+    flagged_lines,
+    in_words,
+    pick_references,
+)
 from s4a.options import Options
 from s4a.schema import POSE
 from s4a.study.netcdf import arrays, attributes, open_file, read
@@ -286,8 +294,50 @@ def check_modes(pca: xr.Dataset, area: float) -> Flags:
     return flags
 
 
+def check_pair(score: float, distortion: float, n: int, options: Options) -> dict[str, str]:
+    """Return status and warning of a single registration, by the limits of :func:`flagged`.
+
+    There is no collection to compare with.  On coarse meshes correct registrations score up to
+    1.2 times the vertex spacing 1 / sqrt(n), so those below twice the spacing are not flagged.
+
+    Parameters
+    ----------
+    score, distortion : float
+        Registration error score, and mean |distortion|.
+    n : int
+        Number of vertices of the coarser surface.
+    options : Options
+        With ``quality_control="off"`` the status is always "ok".
+
+    Returns
+    -------
+    dict
+        ``status``, "ok" or "flagged", and ``warning``, empty if nothing was found.
+
+    Examples
+    --------
+    >>> from s4a.options import Options
+    >>> from s4a.study.quality_control import check_pair
+    >>> check_pair(0.036, 0.4, 6890, Options())["status"]
+    'flagged'
+    >>> check_pair(0.078, 0.17, 200, Options())
+    {'status': 'ok', 'warning': ''}
+    """
+    found: Flags = {}
+    if score > WRONG_RATIO / np.sqrt(n):
+        found, _ = flagged({"pair": score}, {"pair": distortion}, usual=0.0)
+    found = unflagged(found) if options.quality_control == "off" else found
+    is_flagged = any(one.flagged for one in found.get("pair", []))
+    return {
+        "status": "flagged" if is_flagged else "ok",
+        "warning": in_words(found.get("pair", [])),
+    }
+
+
 def flagged(
-    registration_error: dict[str, float], distortion: dict[str, float] | None = None
+    registration_error: dict[str, float],
+    distortion: dict[str, float] | None = None,
+    usual: float | None = None,
 ) -> tuple[Flags, list[str]]:
     """Flag shapes by their registration error, alone and times distortion.
 
@@ -298,6 +348,8 @@ def flagged(
     distortion : dict of str to float, optional
         Mean |distortion|.  A wrong map misses the surface and distorts, so the product separates
         better than either number.
+    usual : float, optional
+        Product of a usual registration; by default the median.
 
     Returns
     -------
@@ -317,7 +369,8 @@ def flagged(
     product = {
         name: score * distortion.get(name, 0.0) for name, score in registration_error.items()
     }
-    usual = float(np.median([value for value in product.values() if value > 0] or [0.0]))
+    if usual is None:
+        usual = float(np.median([value for value in product.values() if value > 0] or [0.0]))
     limit, warning_limit = max(WRONG, WRONG_RATIO * usual), max(UNSURE, UNSURE_RATIO * usual)
     wrong = {
         n: score for n, score in registration_error.items() if score > FLAGGED or product[n] > limit

@@ -252,7 +252,8 @@ class Correspondence(Panel):
         elif shown == "confidence":
             colors = ramp_colors(value, 0, 1)
             bar = color_scale("viridis", 0, 1, f"confidence, {value.mean():.2f} on average")
-            caption = "the registration's confidence, transferred to the shape"
+            caption = "the registration's confidence, transferred to the shape; among shapes in "
+            caption += "similar poses it does not rank the points by their error"
         return (colors, self.transferred(colors)), coordinates, bar, caption
 
     def match_text(self, vertex: object, image: object) -> str:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from s4a import (
     clean,
     cli,
+    correspondence,
     match_pair,
     register_pairs,
     synthetic,
@@ -41,6 +42,7 @@ from s4a.input.annotations import (
 )
 from s4a.input.landmarks import locate
 from s4a.schema import dataset
+from s4a.study import quality_control
 
 OPTIONS = {"n_coarse": 1200, "k": 60}
 
@@ -89,6 +91,15 @@ def test_labels_and_landmarks_of_a_moved_and_renumbered_copy_are_exact(meshes, m
     assert (found["label"].values == order).all()
     assert found["label_share"].values == pytest.approx(1, abs=1e-4)
     assert found["confidence"].values == pytest.approx(1, abs=1e-3)
+    Y, S = as_arrays(copy)
+    for ends, true, X, T in (
+        (("target", "source"), np.argsort(order), Y, S),
+        (("source", "target"), order, *as_arrays(mesh)),
+    ):
+        image = correspondence(study, *ends)
+        assert distance(image["image_position"].values, X[true]).max() < 1e-4 * size
+        corner = image["image_barycentric"].values.argmax(1)
+        assert (T[image["image_triangle"].values, corner] == true).all()
     landmarks = mesh[["landmark_name", "landmark_position"]]
     marks = transfer_landmarks(study, landmarks)["source"]
     exact = locate(landmarks, mesh)["landmark_position"].values @ R.T + [30, -20, 5]
@@ -497,7 +508,9 @@ def test_labels_are_numbered_as_in_the_file_and_dropped_vertices_have_the_neares
         labels_of_mesh(height, mesh)
 
 
-def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path, meshes, capsys):
+def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(
+    tmp_path, meshes, capsys, monkeypatch
+):
     source, target = meshes["brain_01"], meshes["brain_02"]
     loose, L = as_arrays(synthetic.sphere(50, radius=2.0))
     X, T = as_arrays(target)
@@ -515,7 +528,12 @@ def test_the_command_writes_labels_per_vertex_of_the_file_and_landmarks(tmp_path
     label = np.load(tmp_path / "out" / "target one.labels.npy")
     assert label.shape == (len(points),)
     assert (label[50:] == target["label"].values).mean() > 0.93
-    assert cli.main([*command, "--out", str(tmp_path / "sharp"), "--blur", "0"]) == 0
+    monkeypatch.setattr(quality_control, "FLAGGED", 0.0)
+    monkeypatch.setattr(quality_control, "WRONG_RATIO", 0.0)
+    sharp = ["--out", str(tmp_path / "sharp"), "--blur", "0", "--fail-on", "flagged"]
+    assert cli.main([*command, *sharp]) == 3
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert "flagged: registration probably wrong (score 0.0" in last
     sharp = np.load(tmp_path / "sharp" / "target one.labels.npy")
     assert 0.95 < (sharp == label).mean() < 1
     sure = np.load(tmp_path / "out" / "target one.confidence.npy")

@@ -204,3 +204,26 @@ def test_of_maps_with_equal_scores_the_one_that_preserves_curvatures_is_chosen(
 
     assert found(search=False) == "icp"
     assert found(search=True) == "other"
+
+
+@pytest.mark.parametrize(("score", "chosen"), [(0.22, "second"), (0.3, "first")])
+def test_of_maps_with_similar_scores_that_differ_the_better_one_after_refinement_is_chosen(
+    surface, monkeypatch, score, chosen
+):
+    C, flipped = np.eye(10), np.diag((-1.0) ** np.arange(10))
+    maps = ("first", flipped, flipped), ("second", C, C)
+    scores = iter([0.5, 0.2, score, 0.3, 0.1])  # the last two after refinement
+    monkeypatch.setattr(initial_map, "maps_from_signatures", lambda *_: iter(maps))
+    monkeypatch.setattr(initial_map, "stretch", lambda *_: 0.0)
+    monkeypatch.setattr(spectral_icp, "registration_score", lambda *_: next(scores))
+    monkeypatch.setattr(initial_map.fmap, "curvature_difference", lambda *_: 0.0)
+    assert initial_map.best_initial_map(surface, surface, C, search=True)[0] == chosen
+
+
+def test_three_maps_that_agree_end_a_search(surface, monkeypatch):
+    C, scores = np.eye(10), iter([0.09, 0.095, 0.091])
+    monkeypatch.setattr(initial_map, "maps_from_signatures", lambda *_: iter([("other", C, C)] * 9))
+    monkeypatch.setattr(initial_map, "stretch", lambda *_: 0.0)
+    monkeypatch.setattr(spectral_icp, "registration_score", lambda *_: next(scores))
+    monkeypatch.setattr(initial_map.fmap, "curvature_difference", lambda *_: 0.0)
+    assert initial_map.best_initial_map(surface, surface, C, search=True)[0] == "icp"

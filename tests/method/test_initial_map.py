@@ -56,8 +56,11 @@ def test_a_different_pose_is_matched_although_nearest_neighbours_are_wrong(bent,
     assert found.attrs["initialisation"] == "intrinsic+parts+local"
     assert found.attrs["initial_map"].split(",")[0] in ("hks", "wks", "hks+wks", "extremities 1")
     assert error(found, bent[0]) < 0.002
+    assert (found.attrs["status"], found.attrs["warning"]) == ("ok", "")
     monkeypatch.setattr(spectral_icp, "poses_differ", lambda *_: False)
-    assert error(match_pair(*bent, n_coarse=1000, k=50), bent[0]) > 0.05
+    failed = match_pair(*bent, n_coarse=1000, k=50)
+    assert error(failed, bent[0]) > 0.05
+    assert failed.attrs["status"] == "flagged"
 
 
 def test_one_motion_of_all_parts_is_that_of_the_whole(shapes):
