@@ -103,8 +103,8 @@ def _check_numbers(x, names, what):
         found = listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(far)])
         low, high = min(x[rest & ~far]), max(x[rest & ~far])
         text = f"{what}: outliers, {found} (others {low:.10g} to {high:.10g})"
-        others = np.delete(x[rest], abs(x[rest] - np.median(x[rest])).argmax())
-        share = 1 - others.var() * len(others) / (x[rest].var() * rest.sum())
+        remaining = np.delete(x[rest], abs(x[rest] - np.median(x[rest])).argmax())
+        share = 1 - remaining.var() * len(remaining) / (x[rest].var() * rest.sum())
         if share > _ALONE:
             raise ValueError(
                 f"{text}: {share:.1%} of the variance is of one shape, so a test would "
