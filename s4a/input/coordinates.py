@@ -363,7 +363,8 @@ def _of_gifti(data):
     found = [surface_system(to_scanner[:12])] if len(to_scanner) == 16 else []
     if all(word for row in geometry for word in row):
         found.append(_of_volume(*np.array(geometry, float)))
-    if found and np.allclose(*(s.to_scanner for s in (found[0], found[-1])), atol=1e-3):
+    numbers = np.array([s.to_scanner for s in found], float)
+    if len({s.axes for s in found}) == 1 and np.ptp(numbers, axis=0).max() < 1e-3:
         return found[-1]
     return CoordinateSystem("RAS", UNKNOWN, "mm")  # nothing, or two that differ
 
