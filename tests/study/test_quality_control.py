@@ -162,7 +162,7 @@ def test_a_new_shape_is_inserted_as_in_the_study_of_the_others(alone, study, goo
     assert insert(study, {"new": (X / 1000, T)})["report"]["status"].item() == "flagged"
 
 
-def test_panels_and_page_mark_flagged_shapes(study):
+def test_panels_and_page_mark_flagged_shapes(study, no_pictures):
     tabs = explore(study)
     for title in tabs.tabs.titles:
         tabs[title]
