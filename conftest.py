@@ -1,10 +1,12 @@
 """What the tests of both distributions share: small shapes and studies, and how examples run.
 
-Each worker makes the shapes and studies once, when first needed; tests copy what they change.
+Shapes are made once in a worker and the studies on the disk once in a run, when first needed; tests
+copy what they change.
 Examples of docstrings run as they stand, with no name that they do not make themselves; what they
 write to temporary folders is gone afterwards.
 """
 
+import contextlib
 import os
 import sys
 import tempfile
@@ -64,12 +66,43 @@ def brain_files(brains, tmp_path_factory):
     return paths
 
 
+def made_once(tmp_path_factory, name, make):
+    """A folder that one worker makes for all; where none can wait for it, each makes its own."""
+    base = tmp_path_factory.getbasetemp()
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(ImportError):
+            import fcntl
+
+            base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+            fcntl.flock(stack.enter_context(open(base / f"{name}.lock", "w")), fcntl.LOCK_EX)
+        if not (base / f"{name}.made").exists():
+            make(base / name)
+            (base / f"{name}.made").touch()
+    return base / name
+
+
 @pytest.fixture(scope="session")
 def study_folder(brains, tmp_path_factory):
     """The folder of the finished study of the brains."""
-    folder = tmp_path_factory.mktemp("study") / "brains"
-    analyse(brains, store=folder, **OPTIONS).close()
-    return folder
+
+    def make(folder):
+        analyse(brains, store=folder, **OPTIONS).close()
+
+    return made_once(tmp_path_factory, "study_of_brains", make)
+
+
+@pytest.fixture(scope="session")
+def structures_folder(tmp_path_factory):
+    """The folder of the example study of several structures."""
+    from s4a_morphometrics import analyse_structures
+    from s4a_morphometrics.synthetic import subjects
+
+    small = {"n_coarse": 100, "k": 10, "k_init": 6, "n_pairs": 6}
+
+    def make(folder):
+        analyse_structures(subjects(6, 200), store=folder, **small)
+
+    return made_once(tmp_path_factory, "study_of_structures", make)
 
 
 @pytest.fixture(scope="session")

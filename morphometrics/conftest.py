@@ -2,13 +2,13 @@
 
 import pytest
 
-from s4a_morphometrics import synthetic
+from s4a_morphometrics import open_structures, synthetic
 
 
 @pytest.fixture(scope="session")
-def several():
-    """A registered study of six subjects with two structures."""
-    return synthetic.example_structures()
+def several(structures_folder):
+    """A registered study of six subjects with two structures, that of the examples."""
+    return open_structures(structures_folder).load()
 
 
 @pytest.fixture(autouse=True)

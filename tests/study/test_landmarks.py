@@ -1,6 +1,7 @@
 """Landmarks of the user: their effect on the registration, and errors for wrong ones."""
 
 import logging
+import shutil
 import subprocess
 import sys
 
@@ -166,9 +167,16 @@ def marked(tmp_path_factory):
     return meshes, folder
 
 
-def test_a_study_keeps_its_landmarks_and_says_who_has_none(marked, tmp_path):
-    meshes, folder = marked
-    study = analyse(meshes, landmarks=folder, store=tmp_path / "study", **OPTIONS)
+@pytest.fixture(scope="module")
+def store(marked, tmp_path_factory):
+    """The folder of their study."""
+    store = tmp_path_factory.mktemp("marked") / "study"
+    analyse(marked[0], landmarks=marked[1], store=store, **OPTIONS).close()
+    return store
+
+
+def test_a_study_keeps_its_landmarks_and_says_who_has_none(store):
+    study = open_study(store)
     assert study["original/brain_01"]["guide_name"].values.tolist() == list("abcd")
     assert "guide_name" not in study["original/brain_04"]
     coarse = study["coarse/brain_01"]
@@ -180,13 +188,10 @@ def test_a_study_keeps_its_landmarks_and_says_who_has_none(marked, tmp_path):
     assert "brain_04" in study["report"].attrs["remarks"]
 
 
-def test_a_changed_landmark_file_recomputes_its_shape_only(marked, tmp_path):
+def test_a_changed_landmark_file_recomputes_its_shape_only(marked, store, tmp_path):
     meshes, folder = marked
-    own = tmp_path / "marks"
-    own.mkdir()
-    for file in folder.iterdir():
-        (own / file.name).write_bytes(file.read_bytes())
-    analyse(meshes, landmarks=own, store=tmp_path / "study", **OPTIONS)
+    own = shutil.copytree(folder, tmp_path / "marks")
+    shutil.copytree(store, tmp_path / "study")
     before = {f.stem: f.stat().st_mtime_ns for f in (tmp_path / "study/original").glob("*.nc")}
     lines = (own / "brain_02.csv").read_text().splitlines()
     (own / "brain_02.csv").write_text("\n".join(lines[:-1]))

@@ -31,9 +31,9 @@ from browsing import (
 import s4a
 from s4a.show import charts
 from s4a.widgets import Median, Modes
+from s4a_morphometrics import open_structures
 from s4a_morphometrics.region_panel import Region
 from s4a_morphometrics.structures_panel import Structures
-from s4a_morphometrics.synthetic import example_structures
 
 pytestmark = needed
 KINDS = ("Maps", "Region", "Structures", "Comparison", "Progress")
@@ -45,14 +45,14 @@ from IPython.display import display
 import s4a
 from s4a_morphometrics.region_panel import Region
 from s4a_morphometrics.structures_panel import Structures
-from s4a_morphometrics.synthetic import example_structures
+from s4a_morphometrics import open_structures
 from s4a.widgets import Comparison, Maps, Progress
 
 study = s4a.open_study({study!r})
 found = s4a.statistics.regression(study, range(4), of="normal", n_permutations=15)
 p = np.where(np.arange(found.sizes["vertex"]) % 3, 0.4, 0.02)
 found = found.assign(p_family_wise=found["p_family_wise"].copy(data=p))
-several = example_structures()
+several = open_structures({several!r}).load()
 ball = s4a.synthetic.ellipsoid(300)
 compared = s4a.compare(ball, ball, methods=["kNN"], keep=True)
 brains = s4a.synthetic.brains(3, 300, seed=1)
@@ -70,9 +70,10 @@ for kind in {kinds!r}:
 
 
 @pytest.fixture(scope="module")
-def folder(study_folder, tmp_path_factory):
+def folder(study_folder, structures_folder, tmp_path_factory):
     folder = tmp_path_factory.mktemp("panels")
-    source = CELL.format(study=str(study_folder), run=str(folder / "run"), kinds=KINDS)
+    named = {"study": str(study_folder), "several": str(structures_folder)}
+    source = CELL.format(**named, run=str(folder / "run"), kinds=KINDS)
     return notebooks(folder, panels=[source])
 
 
@@ -212,8 +213,10 @@ def test_the_console_has_no_errors(page, messages):
 # ---- without a kernel
 
 
-def test_the_page_of_structures_has_every_level_and_no_control_that_does_nothing(show):
-    page = show(Structures(example_structures()))
+def test_the_page_of_structures_has_every_level_and_no_control_that_does_nothing(
+    show, structures_folder
+):
+    page = show(Structures(open_structures(structures_folder).load()))
     assert page.get_by_text("#4477aa").count() == 0
     before = np.array(visible(page, VIEW).first.evaluate("(c) => [...c.view.surfaces[0].position]"))
     for level in (1, 2):
