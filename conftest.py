@@ -5,6 +5,7 @@ Examples of docstrings run as they stand, with no name that they do not make the
 write to temporary folders is gone afterwards.
 """
 
+import os
 import tempfile
 
 import pytest
@@ -12,6 +13,10 @@ from small import OPTIONS
 
 import s4a
 from s4a import analyse, coarsen, open_study, spectrum, synthetic
+
+# where no number of processes is given, commands use one: to start another takes as long as a small
+# study. Tests of several processes give their number
+os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
 
 
 @pytest.fixture(scope="session")

@@ -9,10 +9,8 @@ positives in real collections, and nearly symmetric rods, discs and tori.
 ``alignment.py rotations [COLLECTION ...]``: an analysis of the files as they are, and ten of files
 that are rotated at random: share of equal matches, and differences of the variance ratios.
 
-``alignment.py femurs``: 16 femurs that are not aligned: rotations, and landmark errors after
-``s4a.analyse`` and after rigid ICP.
-
-``alignment.py tori``: errors of four tori with ground truth.
+``alignment.py femurs``, ``alignment.py vertebrae``: 16 femurs or five vertebrae that are not
+aligned: rotations, and landmark errors after ``s4a.analyse`` and after rigid ICP.
 
 ``alignment.py modes``: simulated modes that are found with the preset of the paper, by alignment.
 
@@ -142,28 +140,6 @@ def torus_position(seed, u, v):
     return np.stack([x, y, z], axis=-1)
 
 
-def tori():
-    """Print mean errors of four tori in % of sqrt(area), and their status, by alignment."""
-    title("alignment", "template", "shape", "error", "status", "confidence")
-    meshes = collection("tori", 4)
-    for alignment in ("given", "search"):
-        study = s4a.analyse(meshes, n_coarse=1000, k=40, alignment=alignment, intersections=False)
-        registration, report = study["registration"], study["report"]
-        template = registration.attrs["template"]
-        kept = study["original"][template]["file_vertex"].values
-        angles = torus_angles(int(template[-1]))[:, kept]
-        size = np.sqrt(registration["vertex_area"].values.sum())
-        for name in meshes:
-            if name == template:
-                continue
-            one = registration.sel(shape=name)
-            X = study["original"][name]["position"].values[one["registered_match"].values]
-            true = torus_position(int(name[-1]), *angles)
-            error = 100 * np.linalg.norm(X - true, axis=1).mean() / size
-            status, confidence = report["status"].sel(shape=name).item(), one["confidence"].values
-            say(alignment, template, name, f"{error:.1f}", status, f"{confidence.mean():.2f}")
-
-
 def low_of(mesh, n_coarse=500):
     """Return the low resolution of a mesh in its frame, without eigenfunctions to speak of."""
     return Shape(coarse=s4a.spectrum(s4a.coarsen(mesh, n_coarse=n_coarse), k=4))
@@ -268,10 +244,10 @@ def rotations(names):
         say(name, len(meshes), f"{100 * equal:.2f} %", f"{most:.0e}")
 
 
-def femurs(n_coarse=1000):
-    """Print rotations and landmark errors of femurs after registration, and after rigid ICP."""
-    meshes = collection("femurs_sicas")
-    marks = {name: landmarks_of(DATA / "femurs_sicas" / f"{name}.json") for name in meshes}
+def landmarks(which, n_coarse=1000):
+    """Print rotations and landmark errors after registration, and after rigid ICP."""
+    meshes = cleaned({name: as_arrays(mesh) for name, mesh in collection(which).items()})
+    marks = {name: landmarks_of(DATA / which / f"{name}.json") for name in meshes}
     options = {"n_coarse": n_coarse, "k": 60, "intersections": False}
     study = s4a.analyse(meshes, **options)
     registration, report = study["registration"], study["report"]
@@ -279,7 +255,7 @@ def femurs(n_coarse=1000):
     X = registration["position"].values
     at = cKDTree(X).query(marks[template])[1]  # vertices of the template
     low = {name: low_of(mesh, n_coarse) for name, mesh in meshes.items()}
-    title("femur", "status", "rotation, degrees off", "error after analyse", "after rigid ICP")
+    title("shape", "status", "rotation, degrees off", "error after analyse", "after rigid ICP")
     errors = []
     for name in meshes:
         if name == template:
@@ -305,22 +281,29 @@ def modes(n=12, n_vertices=2500):
     tree = s4a.synthetic.brains(n, n_vertices)
     meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
     truth = tree["truth"]["true_score"].values  # (shape, mode)
-    title("options", "best |correlation| of each simulated mode", "variance ratios")
-    paper = PRESETS["paper"]
-    rows = {f"paper, {name}": paper | {"alignment": name} for name in ALIGNMENTS}
-    rows |= {f"default, {name}": {"alignment": name} for name in ALIGNMENTS}
+    shares = "variance of three, of five components", "the same at low resolution"
+    title("options", "correlation of each simulated mode", *shares)
+    rows = {f"paper, {name}": PRESETS["paper"] | {"alignment": name} for name in ALIGNMENTS}
+    rows |= {f"default, {name}": {"alignment": name} for name in ALIGNMENTS[:2]}
     for name, options in rows.items():
         study = s4a.analyse(meshes, **{**options, "n_coarse": 1000, "k": 60}, template="brain_01")
-        score = study["pca"]["score"].values
-        both = np.corrcoef(score.T, truth.T)[: score.shape[1], score.shape[1] :]
-        ratio = study["pca"]["explained_variance_ratio"].values[:3]
-        say(name, *(" ".join(f"{v:.2f}" for v in row) for row in (np.abs(both).max(0), ratio)))
+        pca = study["pca"]
+        score = pca["score"].values[:, :3]
+        both = np.corrcoef(score.T, truth.T)[:3, 3:]
+        correlation = " ".join(f"{value:.2f}" for value in np.abs(both).max(0))
+        cells = []
+        for kind in ("", "_low"):
+            explained = np.cumsum(pca[f"explained_variance_ratio{kind}"].values)
+            cells.append(f"{explained[2]:.0%}, {explained[4]:.0%}")
+        say(name, correlation, *cells)
 
 
 if __name__ == "__main__":
     logging.disable(logging.WARNING)
     what, *names = sys.argv[1:] or [""]
-    actions = {"accuracy": accuracy, "femurs": femurs, "modes": modes, "tori": tori}
+    actions = {"accuracy": accuracy, "modes": modes}
+    actions["femurs"] = lambda: landmarks("femurs_sicas")
+    actions["vertebrae"] = lambda: landmarks("vertebrae")
     lists = {"ambiguous": ambiguous, "rotations": rotations}
     if what in lists:
         lists[what](names)

@@ -27,7 +27,11 @@ from s4a.cli.tables import METRICS
 from s4a.evaluation import comparison
 from s4a.evaluation.methods import INITS
 from s4a.geometry.align import farthest_points
+from s4a.geometry.closest import closest_point_in_star, distance_to_surface, interpolate
 from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.method.alignment import transform_onto
+from s4a.method.deform import smoother
+from s4a.options import PRESETS, Options
 from s4a.schema import variable
 from s4a.show import charts
 from s4a.show.draw import ramp_colors
@@ -36,6 +40,8 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspond
 SETS = {"faces": 2, "faust15k": 2, "cats": 2, "kids": 1}  # pairs
 SHOWN = ("geodesic_error", "chamfer", "hausdorff", "dirichlet", "coverage", "bijectivity")
+MEASURED = ("chamfer", "hausdorff", "dirichlet", "coverage", "bijectivity")  # without truth
+NAMES = {"fmap": "standard", "latent": "ours"}  # of the paper
 COMPARED = ("FMAP+ZO", "RE-MATCH", "RE-MATCH refined", "registered")  # on more pairs
 N_LANDMARKS = 10
 LOOKED_AT = ("RE-MATCH", "registered", "registered surface")
@@ -120,20 +126,28 @@ def markdown(rows, head):
     say("\n".join(f"| {' | '.join(map(str, line))} |" for line in lines))
 
 
-def table_1(found, names=None):
-    """Say the means over pairs of the metrics of these names, or all."""
-    mean = found.mean("pair")
-    columns = {name: METRICS[name] for name in names or METRICS if name in mean}
+def table_1(found, names=None, spread=False):
+    """Say the means over pairs of the metrics of these names, or all, and standard deviations."""
+    found = found.assign(seconds=seconds_of(found))
+    known = {"seconds": ("CPU s", 1, 1)} | METRICS
+    columns = {name: known[name] for name in ("seconds", *(names or METRICS)) if name in found}
     rows = []
-    for way in mean["algorithm"].values:
-        one = mean.sel(algorithm=way)
+    for way in found["algorithm"].values:
+        one = found.sel(algorithm=way)
         cells = [
-            "" if np.isnan(one[name].item()) else f"{factor * one[name].item():.{digits}f}"
+            mean_of(factor * one[name].values, digits, spread)
             for name, (_, factor, digits) in columns.items()
         ]
-        rows.append([way, f"{one['block_seconds'].sum().item():.1f}", *cells])
-    heads = [head.removesuffix(" %") for head, *_ in columns.values()]
-    markdown(rows, ["", "CPU s", *heads])
+        rows.append([way, *cells])
+    markdown(rows, ["", *(head.removesuffix(" %") for head, *_ in columns.values())])
+
+
+def mean_of(values, digits, spread=False):
+    """Write the mean, and the standard deviation; nothing if a value is unknown."""
+    if np.isnan(values).any():
+        return ""
+    text = f"{values.mean():.{digits}f}"
+    return f"{text} ± {values.std(ddof=1):.{digits}f}" if spread else text
 
 
 def registered(name, n_pairs, given=None, init=None, peers=False, methods=comparison.METHODS):
@@ -284,37 +298,140 @@ def embedded(n_vertices=20_000, methods=comparison.METHODS):
         verdict(found)
 
 
-def heads(given=None, methods=comparison.METHODS, n_pairs=5):
-    """One real head and others; no truth.  Every pair is printed when it is done.
-
-    And the picture of where the images of two are far from the source.
-    """
-    options = {"k_init": 20, "k": 100, "step": 5}
-    rows, seen = [], {}
+def pairs_of_heads(given, n_pairs):
+    """One real head and others: name, pair, and seconds to read and clean both; no truth."""
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
         first, *others = files_of("heads", folder, given)[: n_pairs + 1]
         mesh, load = comparison.load_mesh(first, "source")
         reference = comparison.Spaces(mesh)
         for path in others:
             mesh, seconds = comparison.load_mesh(path, "target")
-            target, begin = comparison.Spaces(mesh), load + seconds
-            row, outcomes = comparison.metrics_of_pair(
-                reference, target, methods, None, begin, None, 300, options
-            )
-            rows.append(row)
-            if len(seen) < 2:
-                seen[path.stem] = outcomes
-            say(f"\nTable 1, {first.stem} and {path.stem}\n")
-            table_1(xr.concat(rows[-1:], "pair"))
-            figure_3(xr.concat(rows[-1:], "pair"))
+            yield path.stem, comparison.Pair(reference, comparison.Spaces(mesh)), load + seconds
+
+
+def heads(given=None, methods=comparison.METHODS, n_pairs=5):
+    """Table 1 on real heads.  Every pair is printed when it is done.
+
+    And the picture of where the images of two are far from the source.
+    """
+    rows, seen = [], {}
+    for name, pair, load in pairs_of_heads(given, n_pairs):
+        row, outcomes = comparison.metrics_of_pair(pair, methods, load, None, 300)
+        rows.append(row)
+        if len(seen) < 2:
+            seen[name] = outcomes
+        say(f"\nTable 1, head_01 and {name}\n")
+        table_1(xr.concat(rows[-1:], "pair"))
+        figure_3(xr.concat(rows[-1:], "pair"))
     found = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
     say(f"\nTable 1 on real heads: {n_pairs} pairs of 130,000 to 160,000 vertices, no truth\n")
-    table_1(found)
+    table_1(found, MEASURED, spread=True)
     figure_3(found)
     if set(comparison.PAPER_METHODS) <= set(methods):
         verdict(found)
     if set(LOOKED_AT) <= set(methods):
-        where(reference.mesh, seen)
+        where(pair.source.mesh, seen)
+
+
+def readings(source, target, transform, match, reverse, functions=None):
+    """Eq. 9 and 10 in %, by reading of 5.1: which points of which shapes are compared.
+
+    Parameters
+    ----------
+    source, target : Spaces
+    transform : tuple (R, t)
+        Of the source onto the target.
+    match, reverse : int ndarray (n_target,) and (n_source,)
+        Matched vertices of the source and of the target.
+    functions : tuple of float ndarray, optional
+        Compared functions of source and target, (n_source, k) and (n_target, k); by default
+        positions.
+    """
+    (X, Y), (R, t) = (source.X, target.X), transform
+    (_, T), (_, S) = as_arrays(source.mesh), as_arrays(target.mesh)
+    image, placed = X[match], (Y - t) @ R
+    low = [space.sampled["sample_vertex"].values for space in (source, target)]
+    points = {
+        "source, image of the target (as printed)": (X, image),
+        "target, image of the source": (Y, Y[reverse]),
+        "aligned target, its image": (placed, image),
+        "source, smoothed image (eq. 8)": (X, placed + smoothed(target, image - placed)),
+        "the first at 6,000 vertices": [x[v[v >= 0]] for x, v in zip((X, image), low, strict=True)],
+    }
+    F, G = (np.ascontiguousarray(f, np.float32) for f in functions or (X, placed))
+    exact = interpolate(X, T, *closest_point_in_star(G, match, F, T))
+    points["the first, image between vertices"] = (X, exact)
+    gaps = {name: metrics.nearest_distances(*pair) for name, pair in points.items()}
+    gaps["source, surface of the image"] = (distance_to_surface(X, image, S),)
+    return {
+        name: (100 * sum(gap.mean() for gap in pair), 100 * max(gap.max() for gap in pair))
+        for name, pair in gaps.items()
+    }
+
+
+def smoothed(space, d):
+    """Project a displacement of all vertices onto U Phi (4.2)."""
+    shape = space.coarse
+    return shape.U @ (shape.low.Phi @ smoother(shape.low.Phi, shape.full.area, shape.U)(d))
+
+
+def readings_of_pairs(given=None, methods=comparison.PAPER_METHODS, n_pairs=5):
+    """Table 1 on real heads as it can be read: means of both distances over the pairs."""
+    found = {}
+    for _, pair, _ in pairs_of_heads(given, n_pairs):
+        for method in methods:
+            one, transform = pair.run(method), pair.align_samples[0]
+            ends = pair.source, pair.target, transform, one.match, one.reverse
+            for name, values in readings(*ends, one.functions).items():
+                found.setdefault(name, {}).setdefault(method, []).append(values)
+    say(f"\nTable 1 as it can be read, Chamfer / Hausdorff distance, {n_pairs} pairs of heads\n")
+    readings_table(found, methods)
+
+
+def readings_of_collection(given=None):
+    """Table 2 on ten real heads as it can be read, with the paper's preset: means over shapes."""
+    with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
+        tree = s4a.read_shapes(files_of("heads", folder, given))
+        meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
+        found = {}
+        for method in comparison.COLLECTION_METHODS:
+            one = comparison.latent_collection(meshes, method, 0.0, paper_options())
+            for how in comparison.DENSE_MATCHES:
+                column = f"{method}, {NAMES[how]}"
+                for values in readings_to_template(one, how):
+                    for name, pair in values.items():
+                        found.setdefault(name, {}).setdefault(column, []).append(pair)
+    say("\nTable 2 as it can be read, Chamfer / Hausdorff distance, ten heads\n")
+    readings_table(found, list(next(iter(found.values()))))
+
+
+def readings_to_template(found, how):
+    """The template as the target, every other shape as the source."""
+    low, t = found.spaces[found.template].coarse.low, found.template
+    for i, space in enumerate(found.spaces):
+        if i != t:
+            transform = transform_onto(space.coarse.low, low, "icp")
+            functions = [
+                found.shapes[end].full.extend(F)
+                for end, F in zip((i, t), found.functions(i, t, how), strict=True)
+            ]
+            match, reverse = found.match(i, t, how), found.match(t, i, how)
+            yield readings(space, found.spaces[t], transform, match, reverse, functions)
+
+
+def paper_options():
+    """Options of Table 2 with the preset of the paper."""
+    names = ("init", "n_samples", "dense_iterations", "alignment")
+    return Options(**{name: PRESETS["paper"][name] for name in names}, n_pairs=500, seed=0)
+
+
+def readings_table(found, columns):
+    """Say the means of both distances by reading and column."""
+    rows = []
+    for name, by in found.items():
+        means = [np.mean(by[column], 0) for column in columns]
+        rows.append([name, *(f"{chamfer:.3f} / {hausdorff:.2f}" for chamfer, hausdorff in means)])
+    markdown(rows, ["compared", *columns])
 
 
 def where(source, seen):
@@ -399,7 +516,7 @@ def verdict_2(found):
         say(f"- {'holds' if holds else 'does not hold'}: {claim}")
 
 
-PARTS = ("registered", "more", "embedded", "collection", "heads")
+PARTS = ("registered", "more", "embedded", "collection", "heads", "readings")
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
@@ -433,3 +550,7 @@ if __name__ == "__main__":
         table_2(args.data, args.first)
     if "heads" in parts and real:
         heads(args.data, args.methods, args.pairs or 5)
+    if "readings" in args.parts and real:
+        paper = [method for method in args.methods if method in comparison.PAPER_METHODS]
+        readings_of_pairs(args.data, paper, args.pairs or 5)
+        readings_of_collection(args.data)

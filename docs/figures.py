@@ -49,6 +49,7 @@ DATA = HERE.parents[1] / "shared" / "data"  # next to the checkout
 VOLUMES = 24  # label volumes of hippocampi
 SHAPES, VERTICES, PAIR = 12, 40_000, 10_000
 LOOK = {"view": "corner", "up": "z"}
+HALVES = {"default": None, "preset of the paper": "paper"}
 DRAWN = (
     "[...document.querySelectorAll('canvas.s4a-view')]"
     ".some((c) => c.offsetParent && c.view && c.view.frames > 0)"
@@ -66,10 +67,31 @@ def collection(shapes=SHAPES, vertices=VERTICES):
 
 
 @cache
-def analysed(shapes=SHAPES, vertices=VERTICES):
+def analysed(preset=None, shapes=SHAPES, vertices=VERTICES):
     """Study of the collection; its folder exists as long as the process."""
-    folder = Path(tempfile.mkdtemp(prefix="s4a-figures-"))
-    return s4a.analyse(collection(shapes, vertices), store=folder / "study", n_jobs=1)
+    store = Path(tempfile.mkdtemp(prefix="s4a-figures-")) / "study"
+    return s4a.analyse(collection(shapes, vertices), preset=preset, store=store, n_jobs=1)
+
+
+def twice(draw, name, study, size, across=False):
+    """Draw a figure of the paper by default and with its preset, next to or below each other."""
+    figure = Figure(figsize=size, layout="constrained")
+    parts = figure.subfigures(*((1, 2) if across else (2, 1)))
+    for part, (title, preset) in zip(parts, HALVES.items(), strict=True):
+        part.suptitle(title, fontsize=11, weight="bold")
+        draw(part, study(preset))
+    return write(figure, name)
+
+
+def pictures_in(part, pictures):
+    """Show pictures by title in a row."""
+    axes = part.subplots(1, len(pictures))
+    for ax, (title, picture) in zip(axes, pictures.items(), strict=True):
+        ax.set_title(title, fontsize=10)
+        ax.set_axis_off()
+        if picture is not None:
+            ax.imshow(picture)
+    return axes
 
 
 def write(figure, name, dpi=120, folder=None):
@@ -114,7 +136,7 @@ def seen(X, T, size=(240, 205), **options):
 # --------------------------------------------------------------------- the figures of the paper
 
 
-def pipeline(study):
+def pipeline(part, study):
     """Figure 1: input, low resolution, maps, correspondence and modes of variation."""
     template = study["registration"].attrs["template"]
     names = list(study["original"].children)
@@ -125,7 +147,7 @@ def pipeline(study):
     remeshed = [near(*surface(study, template, stage)) for stage in ("original", "coarse")]
     remeshed = [*[seen(*surface(study, template, s)) for s in ("original", "coarse")], *remeshed]
     drawn = mode_pictures(study, (-3, 3), 2, size=(240, 205), **LOOK)
-    modes = [picture for row in drawn for picture in row]
+    modes = [on_white(picture) for row in drawn for picture in row]
     parts = {
         "1 · a collection": tiled([seen(*surface(study, name, "original")) for name in shown]),
         "2 · remeshed": tiled(remeshed),
@@ -133,14 +155,7 @@ def pipeline(study):
         "4 · in correspondence": tiled([seen(X, T, colors=c) for X, T, c in matched]),
         "5 · modes of variation": tiled(modes),
     }
-    parts["5 · modes of variation"] = on_white(parts["5 · modes of variation"])
-    figure = Figure(figsize=(11, 2.35), layout="constrained")
-    axes = figure.subplots(1, len(parts))
-    for ax, (title, picture) in zip(axes, parts.items(), strict=True):
-        ax.set_title(title, fontsize=10)
-        ax.set_axis_off()
-        if picture is not None:
-            ax.imshow(picture)
+    axes = pictures_in(part, parts)
     pairs = study["network"].dataset
     places = network_positions(study, names)
     ends = [[names.index(str(n)) for n in pairs[end].values] for end in ("source", "target")]
@@ -150,7 +165,6 @@ def pipeline(study):
     axes[2].scatter(*places.T, s=26, color="#333333", zorder=2)
     axes[2].scatter(*places[median], s=110, facecolor="none", edgecolor=charts.ORANGE, zorder=3)
     axes[2].margins(0.12)
-    return write(figure, "figure_1")
 
 
 def swapped(vertices=6000, n_coarse=1500, stretch=1.2):
@@ -203,11 +217,15 @@ def seconds(vertices=PAIR):
     )
 
 
-def components(study):
-    """Figure 4: the first three components."""
-    path = s4a.write_picture(study, HERE / "brains.png", width=900)
-    reduce(path)
-    return path
+def components(part, study):
+    """Figure 4: the first three components at -3 and +3 standard deviations, on one scale."""
+    share = study["pca"]["explained_variance_ratio"].values
+    rows = part.subplots(3, 2)
+    for i, row in enumerate(mode_pictures(study, (-3, 3))):
+        for ax, score, picture in zip(rows[i], "−+", row, strict=True):
+            ax.imshow(on_white(picture))
+            ax.set_title(f"mode {i + 1} ({share[i]:.0%}), {score}3 σ", fontsize=9)
+            ax.set_axis_off()
 
 
 def film(study, n_frames=36):
@@ -243,15 +261,15 @@ def variance(study):
 
 
 @cache
-def carried(shapes=5, vertices=PAIR):
-    """Template that is not in the collection, and the study of the other shapes."""
+def carried(preset=None, shapes=5, vertices=PAIR):
+    """Study of a collection, and a template that is not in it."""
     brains = s4a.synthetic.brains(shapes, vertices, seed=0)
     meshes = {name: node.to_dataset() for name, node in brains["original"].children.items()}
     template = meshes.pop(f"brain_{shapes:02d}")
-    return s4a.analyse(meshes, n_jobs=1), template
+    return s4a.analyse(meshes, preset=preset, n_jobs=1), template
 
 
-def labels(held_out):
+def labels(part, held_out):
     """Figure 6: labels of a template, transferred to a shape of the collection."""
     study, template = held_out
     target = study["original"]["brain_01"].to_dataset()
@@ -261,13 +279,20 @@ def labels(held_out):
     right = s4a.metrics.label_accuracy(found, own, s4a.geometry.mesh.vertex_areas(*mesh_of(target)))
     sys.stdout.write(f"figure 6: {right:.1%} of the area has its own label\n")
     palette = label_colors(np.arange(len(LABELS)))
-    shown = {"template": template, "carried to the shape": target, "the shape's own": target}
-    values = [template["label"].values, found, own]
-    colors = {title: palette[value] for title, value in zip(shown, values, strict=True)}
-    return write(charts.surfaces(shown, colors, flat=True), "figure_6")
+    shown = {
+        "template": (template, template["label"].values),
+        "transferred to the shape": (target, found),
+        "the shape's own": (target, own),
+    }
+    options = {"flat": True, "size": (360, 300)}
+    drawn = {
+        title: on_white(render(*mesh_of(mesh), colors=palette[values], **options))
+        for title, (mesh, values) in shown.items()
+    }
+    pictures_in(part, drawn)
 
 
-def landmarks(held_out):
+def landmarks(part, held_out):
     """Figure 7: transferred landmarks of the same template, and the ground truth."""
     study, template = held_out
     target = study["original"]["brain_01"].to_dataset()
@@ -279,18 +304,15 @@ def landmarks(held_out):
     palette = np.array([to_rgb(OKABE_ITO[i % len(OKABE_ITO)]) for i in range(len(true))])
     shown = {
         "template": (template, marks["landmark_position"].values),
-        "carried to the shape": (target, found),
-        "where they should be": (target, true),
+        "transferred to the shape": (target, found),
+        "true positions": (target, true),
     }
-    figure = Figure(figsize=(7.5, 2.4), layout="constrained")
-    for ax, (title, (mesh, places)) in zip(figure.subplots(1, 3), shown.items(), strict=True):
-        X, T = mesh_of(mesh)
+    drawn = {}
+    for title, (mesh, places) in shown.items():
         balls = np.column_stack([places, palette, np.full(len(places), 5.0)]).tolist()
-        X, T, colors = with_balls(X, T, None, balls)
-        ax.imshow(on_white(render(X, T, colors=colors, view=(200, 15), size=(360, 300))))
-        ax.set_title(title, fontsize=10)
-        ax.set_axis_off()
-    return write(figure, "figure_7")
+        X, T, colors = with_balls(*mesh_of(mesh), None, balls)
+        drawn[title] = on_white(render(X, T, colors=colors, view=(200, 15), size=(360, 300)))
+    pictures_in(part, drawn)
 
 
 # ------------------------------------------------------------------------------------ the panels
@@ -470,14 +492,14 @@ def quickstart():
 
 PICTURES = {
     "quickstart": quickstart,
-    "figure_1": lambda: pipeline(analysed()),
+    "figure_1": lambda: twice(pipeline, "figure_1", analysed, (11, 5.2)),
     "figure_2": swapped,
     "figure_3": seconds,
-    "brains": lambda: components(analysed()),
+    "figure_4": lambda: twice(components, "figure_4", analysed, (11, 7.2), across=True),
     "modes": lambda: film(analysed()),
     "figure_5": lambda: variance(analysed()),
-    "figure_6": lambda: labels(carried()),
-    "figure_7": lambda: landmarks(carried()),
+    "figure_6": lambda: twice(labels, "figure_6", carried, (7.5, 5.4)),
+    "figure_7": lambda: twice(landmarks, "figure_7", carried, (7.5, 5.4)),
     "pca": lambda: sliders(analysed()),
     "network": lambda: network(analysed()),
     "scene": lambda: scene(analysed()),

@@ -8,7 +8,7 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -496,10 +496,56 @@ def compare_collection(
     return table.assign_attrs(joint_note(notes))
 
 
+class LatentCollection(NamedTuple):
+    """Latent bases of a collection, its median shape, and CPU seconds of the first three blocks."""
+
+    spaces: list[Spaces]
+    shapes: list[Shape]
+    Y: np.ndarray  # (n_shape, k, m)
+    template: int
+    distance_to_limit: xr.Variable
+    seconds: list[float]
+
+    def functions(
+        self, source: int, target: int, dense_match: str
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the functions of both shapes that eq. 4 or eq. 7 compares, at low resolution."""
+        ends = self.shapes[source], self.shapes[target], (self.Y[source], self.Y[target])
+        if dense_match == DENSE_MATCHES[0]:
+            return match_low(*ends, dense_match=dense_match)[1]
+        return latent_functions(*ends)
+
+    def match(self, source: int, target: int, dense_match: str) -> np.ndarray:
+        """Return the matched vertices of the source ``(n_target,)`` by eq. 4 or eq. 7."""
+        functions = self.functions(source, target, dense_match)
+        return match_functions(self.shapes[source], self.shapes[target], *functions)[0]
+
+
 def run_collection(
     meshes: dict[str, xr.Dataset], method: str, load: float, options: Options
 ) -> xr.Dataset:
     """Compute one row of Table 2."""
+    found, names = latent_collection(meshes, method, load, options), list(meshes)
+    chamfer, full = zip(*(chamfer_to_template(found, how) for how in DENSE_MATCHES), strict=True)
+    measures = {
+        "collection_chamfer": np.stack(chamfer),
+        "collection_seconds": np.array([[*found.seconds, seconds] for seconds in full]),
+        "median_shape": np.array(names[found.template]),
+    }
+    table = xr.Dataset(
+        {name: variable(name, values[None]).isel(algorithm=0) for name, values in measures.items()}
+        | {"distance_to_limit": found.distance_to_limit},
+        attrs=note_on_k(options.k, found.Y.shape[1]),
+    )
+    return table.assign_coords(
+        dense_match=list(DENSE_MATCHES), block=list(COLLECTION_BLOCKS), shape=names
+    )
+
+
+def latent_collection(
+    meshes: dict[str, xr.Dataset], method: str, load: float, options: Options
+) -> LatentCollection:
+    """Compute initial maps, Consistent ZoomOut and the median shape of a collection."""
     names, clock = list(meshes), Clock()
     begin = time.process_time()
     spaces = [Spaces(mesh, options.n_coarse, options.k, options.seed) for mesh in meshes.values()]
@@ -507,7 +553,7 @@ def run_collection(
     bases = [shape.low for shape in shapes]
     k = min(options.k, *(basis.k for basis in bases))
     source, target, maps = initial_maps(bases, options)
-    shared = [load, time.process_time() - begin]
+    seconds = [load, time.process_time() - begin]
     samples = [basis.sample_vertices_of(options.n_samples) for basis in bases]
     growth: dict[str, Any] = {
         "step": options.step,
@@ -519,24 +565,10 @@ def run_collection(
     result = dataset(latent_basis=Y, latent_eigenvalue=low).assign_coords(shape=names)
     spectra = np.stack([basis.eigenvalue[:k] for basis in bases])
     result = clock("latent", median.median_shape, result, spectra)
-    shared.append(clock["latent"])
+    seconds.append(clock["latent"])
     template = names.index(result.attrs["median"])
-    chamfer, full = zip(
-        *(chamfer_to_template(spaces, shapes, Y, template, how) for how in DENSE_MATCHES),
-        strict=True,
-    )
-    measures = {
-        "collection_chamfer": np.stack(chamfer),
-        "collection_seconds": np.array([[*shared, seconds] for seconds in full]),
-        "median_shape": np.array(names[template]),
-    }
-    table = xr.Dataset(
-        {name: variable(name, values[None]).isel(algorithm=0) for name, values in measures.items()}
-        | {"distance_to_limit": result["distance_to_limit"].variable},
-        attrs=note_on_k(options.k, k),
-    )
-    return table.assign_coords(
-        dense_match=list(DENSE_MATCHES), block=list(COLLECTION_BLOCKS), shape=names
+    return LatentCollection(
+        spaces, shapes, Y, template, result["distance_to_limit"].variable, seconds
     )
 
 
@@ -562,23 +594,15 @@ def initial_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.n
     return *np.array(ends).T, np.stack(maps)
 
 
-def chamfer_to_template(
-    spaces: list[Spaces], shapes: list[Shape], Y: np.ndarray, template: int, dense_match: str
-) -> tuple[np.ndarray, float]:
+def chamfer_to_template(found: LatentCollection, dense_match: str) -> tuple[np.ndarray, float]:
     """Return eq. 9 of each shape and the image of the template ``(n,)``, and CPU seconds."""
-    chamfer = np.full(len(shapes), np.nan)
+    chamfer = np.full(len(found.shapes), np.nan)
     seconds = 0.0
-    for i, (space, shape) in enumerate(zip(spaces, shapes, strict=True)):
-        if i == template:
+    for i, space in enumerate(found.spaces):
+        if i == found.template:
             continue
         begin = time.process_time()
-        ends = shape, shapes[template], (Y[i], Y[template])
-        functions = (
-            match_low(*ends, dense_match=dense_match)[1]
-            if dense_match == DENSE_MATCHES[0]
-            else latent_functions(*ends)
-        )
-        match, *_ = match_functions(shape, shapes[template], *functions)
+        match = found.match(i, found.template, dense_match)
         seconds += time.process_time() - begin
         chamfer[i] = metrics.chamfer(space.X, space.X[match])
     return chamfer, seconds

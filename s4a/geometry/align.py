@@ -284,8 +284,7 @@ def icp_each(
             P = np.concatenate([X, source.X[here]])  # (pairs, 3)
             Q = np.concatenate([target.X[there], Y])
             distance = np.concatenate([forth_distance, back_distance])
-            # mutual nearest neighbours are kept or dropped together, whatever the rounding
-            keep = distance <= (1 + 1e-9) * np.quantile(distance, 1 - trim)
+            keep = _nearer_pairs(distance, trim)
             residual = float(np.sqrt(weight[keep] @ distance[keep] ** 2 / weight[keep].sum()))
             R, t, _ = rigid_transform(P[keep], Q[keep], weight[keep])
             if ends[i][2] - residual >= least:
@@ -294,6 +293,16 @@ def icp_each(
         if not moving:
             break
     return ends
+
+
+def _nearer_pairs(distance, trim):
+    """Pairs without a share of the farthest; mutual nearest neighbours go together."""
+    if not trim:
+        return slice(None)
+    at = (1 - trim) * (len(distance) - 1)
+    below = int(at)
+    low, high = np.partition(distance, (below, below + 1))[below : below + 2]
+    return distance <= (1 + 1e-9) * (low + (high - low) * (at - below))  # whatever the rounding
 
 
 def _nearest(shape, rows):

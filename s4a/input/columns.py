@@ -5,25 +5,22 @@ Values are reported and never changed.  A test is refused where it would be mean
 
 import logging
 import re
-import unicodedata
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.special import stdtr
 
-from s4a.input.files import visible
-from s4a.input.subjects import is_plain_number, listed
+from s4a.input.subjects import is_plain_number, listed, look_alikes
 
 log = logging.getLogger(__name__)
 
 # -9, 99, -999, 9998 and alike, and the largest integers of 16 and 32 bits
 _CODES = re.compile(r"-1|-?(9*[789]|77+|88+|32768|2147483648)|32767|65535|2147483647")
-_WORDS = re.compile(r"[?.]+|unknown|missing|not available|n\.a\.|n\.?d\.?|#.*[!?]", re.IGNORECASE)
-_LEVEL, _SLIP_LEVEL = 3e-4, 0.04  # of an outlier in a column; of a value ten times the others
-# Cyrillic and Greek letters and dashes that look like Latin letters and the hyphen
-_SAME = str.maketrans(
-    "аеорсухіѕјкмнтвΑΒΕΖΗΙΚΜΝΟΡΤΥΧαοινρυχ‐‑‒–—−", "aeopcyxisjkmhtbABEZHIKMNOPTYXaoivpux------"
+_WORDS = re.compile(
+    r"[?.]+|none|unknown|missing|not? (available|data)|n\.a\.|n\.?d\.?|#.*[!?]", re.IGNORECASE
 )
+_ALONE = 0.995  # share of the variance of a column that an outlier may have
+_LEVEL, _SLIP_LEVEL = 3e-4, 0.04  # of an outlier in a column; of a value ten times the others
 
 
 def check_column(
@@ -45,8 +42,9 @@ def check_column(
     Raises
     ------
     ValueError
-        If a value is certainly a code of a missing value, or two names differ only in characters
-        that cannot be seen.  Other findings are warnings.
+        If a value is certainly a code of a missing value, an outlier has almost the whole variance
+        of the column, or two names differ only in characters that cannot be seen.  Other findings
+        are warnings.
 
     Examples
     --------
@@ -95,15 +93,17 @@ def _check_numbers(x, names, what):
     far = rest.copy()
     far[rest] = outlying(x[rest])
     if far.any():
-        rest = x[rest & ~far]
-        log.warning(
-            "%s: outliers, %s (others %.10g to %.10g): correct the value, or write NA, if it is "
-            "wrong; the test uses it",
-            what,
-            listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(far)]),
-            rest.min(),
-            rest.max(),
-        )
+        found = listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(far)])
+        low, high = min(x[rest & ~far]), max(x[rest & ~far])
+        text = f"{what}: outliers, {found} (others {low:.10g} to {high:.10g})"
+        others = np.delete(x[rest], abs(x[rest] - np.median(x[rest])).argmax())
+        share = 1 - others.var() * len(others) / (x[rest].var() * rest.sum())
+        if share > _ALONE:
+            raise ValueError(
+                f"{text}: {share:.1%} of the variance is of one shape, so that a test would "
+                "compare it with all others: correct the value, or write NA"
+            )
+        log.warning("%s: correct the value, or write NA, if it is wrong; the test uses it", text)
 
 
 def _report_codes(codes, cells, names, what, others):
@@ -217,36 +217,3 @@ def _p_value(value, rest):
 def _p_of_new(value, rest, step):
     deviation = np.hypot(rest.std(ddof=1), step) * np.sqrt(1 + 1 / len(rest))
     return 2 * stdtr(len(rest) - 1, -abs(value - rest.mean()) / deviation)
-
-
-def look_alikes(cells: Sequence[str]) -> list[tuple[bool, list[str]]]:
-    """Return different texts that look alike, and whether they cannot be distinguished by eye.
-
-    Examples
-    --------
-    >>> from s4a.input.columns import look_alikes
-    >>> look_alikes(["a", "A", "b", "b\\u200b"])
-    [(False, ['A', 'a']), (True, ['b', 'b\\u200b'])]
-    """
-    found = []
-    by_look: dict[str, list[str]] = {}
-    for cell in sorted({*cells}):
-        by_look.setdefault(look(cell), []).append(cell)
-    for variants in by_look.values():
-        if len(variants) > 1:
-            found.append((len({*map(visible, variants)}) < len(variants), variants))
-    return found
-
-
-def look(text: str) -> str:
-    """Return what texts that look alike have in common: compatible letters in lower case.
-
-    Examples
-    --------
-    >>> from s4a.input.columns import look
-    >>> look(" Site\\u00a01 ") == look("site 1"), look("01") == look("1.0")
-    (True, True)
-    """
-    text = unicodedata.normalize("NFKC", visible(text).translate(_SAME))
-    text = unicodedata.normalize("NFKC", text.casefold().translate(_SAME))
-    return str(float(text)) if is_plain_number(text) else text

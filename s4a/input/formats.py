@@ -468,6 +468,8 @@ PLY_TYPES = {
     "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
     "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
 }  # fmt: skip
+_COUNTED = "one mesh, with all of its rows counted, expected"
+_REMEDY = "correct the counts, or write each mesh to a file of its own"
 _PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -480,16 +482,16 @@ def _ply_tables(data):
     body = data[end.end() :]
     if second := re.search(rb"ply\s+format (ascii|binary_\w+_endian) ", body):
         raise ValueError(
-            f"one mesh expected, found a second PLY at byte {end.end() + second.start()}: "
-            "write each mesh to a file of its own"
+            f"one mesh expected, found a second PLY at byte {end.end() + second.start()}: {_REMEDY}"
         )
     if kind == "ascii":  # convert numbers to eight bytes each, for the binary reader
         body = np.array(body.split(), np.float64).tobytes()
-    at, table = 0, {}
+    at, table, least = 0, {}, 1
     for name, count, properties in elements:
         table[name], at = _ply_rows(body, at, name, count, properties)
-        if "vertex" in table and ("face" in table or "tristrips" in table):
-            break
+        least = max(sum(types[0].itemsize for _, types in properties), 1)
+    if more := (len(body) - at) // least:
+        raise ValueError(f"{_COUNTED}, found {more} more rows than the header says: {_REMEDY}")
     return table
 
 
@@ -654,8 +656,8 @@ def _read_off(data):
     if min(n, m) < 0:
         raise ValueError(f"counts from 0 expected, found {n} vertices and {m} faces")
     _need(n + m, len(lines) - 1, "lines of vertices and faces")
-    if any(line.lstrip().startswith(b"OFF") for line in lines[n + m + 1 :]):
-        raise ValueError("one mesh expected, found a second OFF: write each to a file of its own")
+    if more := len(lines) - 1 - n - m:
+        raise ValueError(f"{_COUNTED}, found {more} more lines than its counts say: {_REMEDY}")
     points = np.array([line.split()[:3] for line in lines[1 : n + 1]], np.float64)
     corners, sizes = [], []
     for line in lines[n + 1 : n + 1 + m]:
@@ -708,7 +710,7 @@ def _read_stl(data):
         if len(data) >= 84 + 50 * (count + 1):
             raise ValueError(
                 f"{count} triangles of {84 + 50 * count} bytes expected, found {len(data)} bytes: "
-                "write each mesh to a file of its own"
+                f"{_REMEDY}"
             )
         corners = np.frombuffer(data, _STL_TRIANGLE, count, 84)["corner"].reshape(-1, 3)
     first, group = equal_rows(corners)

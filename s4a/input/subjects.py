@@ -3,6 +3,7 @@
 import itertools
 import logging
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -17,7 +18,12 @@ from s4a.schema import covariate
 
 log = logging.getLogger(__name__)
 
-MISSING = ("", "-", "na", "n/a", "nan", "#n/a", "null")  # cells without a value, in lower case
+# cells without a value, in lower case
+MISSING = ("", "-", "na", "n/a", "nan", "#n/a", "<na>", "null")
+# Cyrillic and Greek letters and dashes that look like Latin letters and the hyphen
+_SAME = str.maketrans(
+    "аеорсухіѕјкмнтвΑΒΕΖΗΙΚΜΝΟΡΤΥΧαοινρυχ‐‑‒–—−", "aeopcyxisjkmhtbABEZHIKMNOPTYXaoivpux------"
+)
 _PERSON = re.compile(r"(subject|participant|patient|person)([ _-]?(id|nr|no))?", re.IGNORECASE)
 
 
@@ -36,6 +42,10 @@ def _head_and_rows(path):
         raise ValueError(
             f"{path}: columns need unique names without '/'; found {wrong[0]!r} in {head}"
         )
+    for same, variants in look_alikes(head):
+        if same:
+            raise ValueError(f"{path}: columns need names that differ visibly; found {variants}")
+        log.warning("%s: names of columns differ only in case or form: %s", path, variants)
     ragged = [(line, row) for line, row in rows.items() if len(row) != len(head)]
     if ragged:
         line, row = ragged[0]
@@ -250,3 +260,36 @@ def with_table(study: xr.DataTree, path: Path | str) -> xr.DataTree:
     names = report["shape"].values.tolist()
     nodes = {n.path: n.to_dataset(inherit=False) for n in study.subtree if n.path != "/subjects"}
     return xr.DataTree.from_dict(nodes | {"/subjects": read_table(path, names)}, name=study.name)
+
+
+def look_alikes(cells: Sequence[str]) -> list[tuple[bool, list[str]]]:
+    """Return different texts that look alike, and whether they cannot be distinguished by eye.
+
+    Examples
+    --------
+    >>> from s4a.input.subjects import look_alikes
+    >>> look_alikes(["a", "A", "b", "b\\u200b"])
+    [(False, ['A', 'a']), (True, ['b', 'b\\u200b'])]
+    """
+    found = []
+    by_look: dict[str, list[str]] = {}
+    for cell in sorted({*cells}):
+        by_look.setdefault(look(cell), []).append(cell)
+    for variants in by_look.values():
+        if len(variants) > 1:
+            found.append((len({*map(visible, variants)}) < len(variants), variants))
+    return found
+
+
+def look(text: str) -> str:
+    """Return what texts that look alike have in common: compatible letters in lower case.
+
+    Examples
+    --------
+    >>> from s4a.input.subjects import look
+    >>> look(" Site\\u00a01 ") == look("site 1"), look("01") == look("1.0")
+    (True, True)
+    """
+    text = unicodedata.normalize("NFKC", visible(text).translate(_SAME))
+    text = unicodedata.normalize("NFKC", text.casefold().translate(_SAME))
+    return str(float(text)) if is_plain_number(text) else text

@@ -14,7 +14,9 @@ the bending energy, the integral of |Laplacian|^2 of the displacement.  The stif
 step to step, as in the non-rigid ICP of Amberg, Romdhani and Vetter (CVPR 2007), and further if the
 bending energy has converged: then the template follows the shape.  If the energy still grows, less
 stiffness would fit noise.  First, very stiff iterations merge similar initialisations into their
-mean (:func:`converging_initialisations`).  Lengths are for surfaces of unit area.
+mean (:func:`converging_initialisations`).  Surfaces such as tori slide onto themselves in these
+(:func:`slides`); then they are left out, and the tangential weight is larger.  Lengths are for
+surfaces of unit area.
 
 These terms do not keep a surface from sliding over its own boundary.  If both boundaries coincide
 after two steps, squared distances between them, across the boundary and within the surface, are
@@ -71,12 +73,19 @@ class Schedule(NamedTuple):
     further: int  # number of final steps that need a converged bending energy
     iterations: int  # of a step, at most
     tolerance: float  # share of sqrt(area): a step ends if an iteration moves vertices less
+    slide: tuple[float, float] = SLIDE  # tangential weight in the first two steps, and the others
 
 
 DEFORMATION = Schedule(STIFFNESS, _N_FURTHER, 8, 1e-3)
 # stiff enough for initialisations to converge.  Tuned on heads 2 to 10, reported on other
 # collections
 CONVERGENCE = Schedule(np.array([1e-2, 1e-3]), 0, 32, 1e-4)
+# with more tangential weight, for surfaces that slide onto themselves
+NO_SLIDING = DEFORMATION._replace(slide=(_LOCAL_SLIDE, _LOCAL_SLIDE))
+# share of sqrt(area), and multiple of the distance between initialisations: very stiff iterations
+# that lead farther away from all of them slide.  They move tori by 0.034 to 0.09, 3.6 to 4.6 times
+# that distance; brains, faces, skulls and vertebrae by 0.004 to 0.021, up to 2.7 times
+_MIN_SLIDING, _MIN_RATIO = 0.03, 2.0
 Rows = Array | slice
 _ALL = slice(None)
 
@@ -319,10 +328,11 @@ def elastic_iterations(
         penalty = np.kron(np.eye(3), B.T @ (stiffness * bending * B))
         # keeps the matrix definite if the initial positions are smooth
         penalty[np.diag_indices_from(penalty)] += 1e-12
+        slide = schedule.slide[step >= 2]
         for _ in range(schedule.iterations):
             y, m = _attraction(source, target, X, vertices)
             # for the change of w, whose rounding is smaller than that of w
-            matrix, right = normal_equations(F, area, m, y - X[vertices], SLIDE[step >= 2], mass)
+            matrix, right = normal_equations(F, area, m, y - X[vertices], slide, mass)
             boundary = boundary_attraction(source, target, X) if step >= 2 else None
             if boundary is not None:
                 vertex, length, across, y = boundary
@@ -384,6 +394,29 @@ def converging_initialisations(
         name: tuple(sum(parameter) / len(parameter) for parameter in zip(*members, strict=True))
         for name, members in groups.items()
     }
+
+
+def slides(target: Basis, warps: dict[str, Warp], converged: dict[str, Warp]) -> bool:
+    """Return whether very stiff iterations slide along the surface, away from all initialisations.
+
+    A ring hardly changes if it rotates about its axis, so stiff iterations follow small differences
+    of its thickness.  Initialisations that agree are more accurate then.  A single one is no
+    evidence.
+
+    Parameters
+    ----------
+    target : Basis
+    warps, converged : dict
+        Warps before and after :func:`converging_initialisations`.
+    """
+    starts, ends = ([move(target, warp) for warp in some.values()] for some in (warps, converged))
+
+    def distance(X, Y):
+        return np.linalg.norm(X - Y, axis=1) @ target.area
+
+    apart = max(distance(X, Y) for X in starts for Y in starts)
+    moved = min(distance(X, Y) for X in starts for Y in ends)
+    return len(starts) > 1 and bool(moved > max(_MIN_SLIDING, _MIN_RATIO * apart))
 
 
 def local_iterations(

@@ -16,11 +16,13 @@ from s4a.method import spectral_icp
 from s4a.method.deform import displacement_in_template, distortion
 from s4a.method.elastic import (
     DEFORMATION,
+    NO_SLIDING,
     STIFFNESS,
     Landmarks,
     converging_initialisations,
     elastic_iterations,
     local_iterations,
+    slides,
 )
 from s4a.method.fmap import fmap_from_match
 from s4a.method.initial_map import nearest_after_alignment
@@ -530,12 +532,19 @@ def elastic_surfaces(
 
     Initialisations that converge are merged, see
     :func:`s4a.method.elastic.converging_initialisations`.  If their mean ends on a wrong fold, less
-    stiff iterations from the separate initialisations, `less_stiff`, may find the right one.
+    stiff iterations from the separate initialisations, `less_stiff`, may find the right one.  They
+    are not merged either if that :func:`s4a.method.elastic.slides` along the surface.
     """
     M, N, landmarks = source.full, target.low_on_surface, _common_landmarks(source, target)
-    if not less_stiff:
-        warps = converging_initialisations(M, N, warps, landmarks)
-    schedule = DEFORMATION._replace(stiffness=STIFFNESS[_LESS_STIFF_STEP if less_stiff else 0 :])
+    schedule = DEFORMATION
+    if less_stiff:
+        schedule = DEFORMATION._replace(stiffness=STIFFNESS[_LESS_STIFF_STEP:])
+    elif warps:
+        converged = converging_initialisations(M, N, warps, landmarks)
+        if slides(N, warps, converged):
+            schedule = NO_SLIDING
+        else:
+            warps = converged
     surfaces = {}
     for name, initial in warps.items():
         warp = elastic_iterations(M, N, initial, schedule, landmarks=landmarks)

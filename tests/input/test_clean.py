@@ -404,10 +404,10 @@ def test_any_heap_of_triangles_becomes_a_manifold_or_an_error():
         X[rng.random(n) < 0.02] = np.nan
         T = rng.integers(0, n, (m, 3))
         try:
-            clean_arrays(X, T, components="all")
+            counts = cleaned(X, T, components="all")[2]
         except ValueError:
             continue
-        assert cleaned(X, T, components="all")[2]["genus"] >= 0
+        assert counts["genus"] >= 0
         manifolds += 1
     assert manifolds > 400
 

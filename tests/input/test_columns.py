@@ -1,10 +1,12 @@
 """The check of columns before a test: what is found, and that clean columns are not reported."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
-from s4a.input.columns import check_column, look_alikes
-from s4a.input.subjects import read_table
+from s4a.input.columns import check_column
+from s4a.input.subjects import look_alikes, read_table
 
 AGES = [20 + 3 * i + i * i % 5 for i in range(12)]
 NAMES = [f"s{i}" for i in range(12)]
@@ -40,6 +42,9 @@ def test_other_codes_and_outliers_are_named_with_the_values_of_the_others(caplog
         )
     found = findings(with_value(290), caplog)
     assert "outliers, 290 of s3 (others 20 to 54): correct the value, or write NA" in found
+    for value in (1e10, -1e5):
+        assert "error: it: outliers" in findings(with_value(value), caplog)
+        assert "variance is of one shape" in findings(with_value(value), caplog)
     assert "99 of s2, 99 of s7 may be a code" in findings(with_value(99, 2, 7), caplog)
     assert "9 of s3 may" in findings(with_value(9, values=[1, 2] * 6), caplog)
     assert "1750 of s3" in findings(with_value(1750, values=np.arange(12) + 165), caplog)
@@ -101,11 +106,12 @@ def test_names_of_groups_that_look_alike_are_named(one, two, refused, caplog):
 
 def test_codes_among_names_of_groups_are_named(caplog):
     assert "error: it: -999 of s2 is a code" in findings(["f", "m", "-999", "f"], caplog)
-    assert "? of s2 may be a code" in findings(["f", "m", "?", "f"], caplog)
+    for cell in ("?", "None", "no data", "n.d."):
+        assert f"{cell} of s2 may be a code" in findings(["f", "m", cell, "f"], caplog)
     assert "-9 of s2 may" in findings([1, 2, -9, 1, 2], caplog, categories=True)
 
 
-def test_tables_of_windows_and_excel_are_read(tmp_path):
+def test_tables_of_windows_and_excel_are_read(tmp_path, caplog):
     names = ["head_1", "head_2", "Muller_3"]
     for folder in ("C:\\data\\heads\\", "heads\\", "\\\\server\\share\\", "../", "\u200b"):
         rows = [f"{folder}{file}" for file in ("head_2.ply", "Mu\u0308ller 3.ply", "head_1.ply")]
@@ -117,6 +123,11 @@ def test_tables_of_windows_and_excel_are_read(tmp_path):
         assert {name: column.values.tolist() for name, column in table.items()} == {
             "age": [4, 2, 3]
         }
+    for head, refused in (("age,Age", False), ("age,a\u200bge", True), ("\u00e9,e\u0301", True)):
+        (tmp_path / "t.csv").write_text(f"shape,{head}\nhead_1,1,2\nhead_2,2,2\n")
+        with pytest.raises(ValueError) if refused else nullcontext():
+            read_table(tmp_path / "t.csv", names)
+        assert refused or "['Age', 'age']" in caplog.text
     (tmp_path / "t.csv").write_text("shape,age,\nhead_1,1,\nhead_2,2,x\n")
     with pytest.raises(ValueError, match="unique names"):
         read_table(tmp_path / "t.csv", names)

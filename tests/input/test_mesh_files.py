@@ -338,8 +338,12 @@ def test_a_second_mesh_in_a_file_is_named(tmp_path):
     for order in ("ascii", "binary_little_endian"):
         with pytest.raises(ValueError, match=r"one mesh expected, found a second PLY at byte \d+"):
             read_mesh(file(tmp_path, "m.ply", 2 * ply(order)))
-    with pytest.raises(ValueError, match="one mesh expected, found a second OFF"):
-        read_mesh(file(tmp_path, "m.off", 2 * "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"))
+        longer = ply(order) + (b"3 0 1 2\n" if order == "ascii" else bytes(26))
+        with pytest.raises(ValueError, match=r"found \d+ more rows than the header says"):
+            read_mesh(file(tmp_path, "m.ply", longer))
+    for more in ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "3 0 1 2\n"):
+        with pytest.raises(ValueError, match=r"found \d more lines than its counts say"):
+            read_mesh(file(tmp_path, "m.off", f"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n{more}"))
 
 
 def test_text_in_utf_16_is_named(tmp_path):

@@ -188,8 +188,12 @@ def test_every_picture_of_the_pages_is_drawn_by_a_command_and_the_film_is_small(
 def test_the_figures_of_the_paper_are_drawn_from_a_study(study_folder, tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "HERE", tmp_path)
     study = importlib.import_module("s4a").open_study(study_folder)
-    for draw in (figures.pipeline, figures.components, figures.variance):
-        with Image.open(draw(study)) as picture:
+    drawn = [
+        figures.twice(draw, f"figure_{i}", lambda preset: study, (11, 5))
+        for i, draw in enumerate((figures.pipeline, figures.components))
+    ]
+    for path in (*drawn, figures.variance(study)):
+        with Image.open(path) as picture:
             assert picture.width > 400
             assert len(picture.convert("RGB").getcolors(256)) > 20
     with Image.open(figures.film(study, n_frames=2)) as film:

@@ -29,11 +29,29 @@ def value_of(code, names):
     return eval(last, names)
 
 
-def test_every_cell_of_the_gallery_runs_and_shows_a_picture(tmp_path, monkeypatch):
+@pytest.fixture
+def small(tmp_path, monkeypatch):
+    """A folder, in which brains and low resolutions have at most so many vertices."""
+
+    def limited(function, name, most):
+        def call(*args, **options):
+            if name in options:
+                options[name] = min(options[name], most)
+            return function(*args, **options)
+
+        return call
+
+    monkeypatch.chdir(tmp_path)
+    matplotlib.use("agg")
+    brains = s4a.synthetic.brains
+    monkeypatch.setattr(s4a.synthetic, "brains", lambda m, n, **o: brains(m, min(n, 800), **o))
+    for name in ("analyse", "match_pair", "register_pairs"):
+        monkeypatch.setattr(s4a, name, limited(getattr(s4a, name), "n_coarse", 250))
+
+
+def test_every_cell_of_the_gallery_runs_and_shows_a_picture(small):
     pytest.importorskip("skimage")
     pytest.importorskip("anywidget")
-    matplotlib.use("agg")
-    monkeypatch.chdir(tmp_path)
     first, *questions = cells("gallery.md")
     names = {}
     exec(first, names)
@@ -51,10 +69,8 @@ def test_every_cell_of_the_gallery_runs_and_shows_a_picture(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("page", ["data", "options", "results", "programs"])
-def test_every_recipe_is_a_question_and_runs_in_at_most_fifteen_lines(page, tmp_path, monkeypatch):
+def test_every_recipe_is_a_question_and_runs_in_at_most_fifteen_lines(page, small):
     pytest.importorskip("skimage")
-    matplotlib.use("agg")
-    monkeypatch.chdir(tmp_path)
     text = (DOCS / "howto" / f"{page}.md").read_text(encoding="utf-8")
     assert [title for title in re.findall("^## (.*)", text, re.MULTILINE) if "?" not in title] == []
     first, *recipes = cells(f"howto/{page}.md")

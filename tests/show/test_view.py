@@ -103,6 +103,13 @@ def study():
     return make_study()
 
 
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Draw nothing, where a test is about the text of a page."""
+    for module in (page, pictures):
+        monkeypatch.setattr(module, "render", lambda *a, **options: np.zeros((2, 2, 4), np.uint8))
+
+
 @pytest.fixture(scope="module")
 def html(study):
     return page.study_html(study, title="Seven <ellipsoids>")
@@ -206,7 +213,7 @@ def test_sliders_are_first_and_the_contents_link_to_every_section(html):
     assert len(headings) == len(page.SECTIONS)
 
 
-def test_warnings_are_at_the_top_and_every_shape_links_to_its_picture(study):
+def test_warnings_are_at_the_top_and_every_shape_links_to_its_picture(study, no_pictures):
     part = study.copy()
     report = part["report"].to_dataset()
     kinds = ["", "mirrored", "", "", "", "", ""]
@@ -282,7 +289,7 @@ def test_the_scale_of_modes_is_the_displacement_at_three_standard_deviations():
     np.testing.assert_allclose(mode_limits(of_four), 3 * 2, rtol=0.01)
 
 
-def test_of_many_modes_the_page_holds_the_first(study, monkeypatch):
+def test_of_many_modes_the_page_holds_the_first(study, monkeypatch, no_pictures):
     monkeypatch.setattr(page, "N_LIVE", 2)
     html = page.study_html(study)
     state = json.loads(re.search(r'id="modes-state">(.*?)</script>', html, re.DOTALL)[1])
@@ -299,11 +306,7 @@ def test_the_page_is_the_same_every_time(study, html):
 @pytest.mark.parametrize(
     "node", ["original", "coarse", "network", "latent", "registration", "pca", "report"]
 )
-def test_an_unfinished_study_shows_what_there_is(study, node, tmp_path, monkeypatch):
-    for module in (page, pictures):
-        monkeypatch.setattr(
-            module, "render", lambda *surface, **options: np.zeros((2, 2, 4), np.uint8)
-        )
+def test_an_unfinished_study_shows_what_there_is(study, node, tmp_path, no_pictures):
     part = study.copy()
     del part[node]
     text = page.write_page(part, tmp_path / "page.html").read_text(encoding="utf-8")
@@ -311,12 +314,13 @@ def test_an_unfinished_study_shows_what_there_is(study, node, tmp_path, monkeypa
     assert text.count("<section>") == len(page.SECTIONS)
 
 
-def test_a_vertex_of_unknown_distortion_leaves_the_others_their_colours(study, monkeypatch):
+def test_a_vertex_of_unknown_distortion_leaves_the_others_their_colours(
+    study, monkeypatch, no_pictures
+):
     limits = []
     monkeypatch.setattr(
         page, "ramp_colors", lambda values, low, high: limits.append(high) or 0 * values[:, None]
     )
-    monkeypatch.setattr(page, "render", lambda *surface, **options: np.zeros((2, 2, 4), np.uint8))
     registration = study["registration"].to_dataset()
     values = np.random.default_rng(0).random(registration["confidence"].shape)
     values[:, 3] = np.nan

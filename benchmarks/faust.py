@@ -1,0 +1,155 @@
+"""Bodies by the published protocols: FAUST_r, and the connectivity track of SHREC'19.
+
+``faust.py [--shapes N] [--pairs N] [--seed S]``: shapes 000 to 019 of FAUST_r in the shared data
+beside the checkout, 5,000 vertices, remeshed separately.  All ordered pairs within one study, and
+some pairs matched alone.
+
+``faust.py --shrec19 FOLDER [--pairs N]``: pairs of SHREC'19, *Matching Humans with Different
+Connectivity*, matched alone.  The data are not shipped; FOLDER is a copy of
+``riccardomarin/SHREC19_matching_humans``, see :func:`shrec19`.
+
+Protocol: each point of the ground truth on the first shape is mapped to a vertex of the second; its
+error is the length of the shortest path along edges (Dijkstra) from there to the true vertex, over
+the square root of the second shape's area, times 100.
+"""
+
+import argparse
+import itertools
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import scipy.io
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+
+import s4a
+from s4a.geometry.mesh import edge_graph, edges, triangle_areas
+from s4a.schema import dataset
+
+DATA = Path(__file__).parents[2] / "shared" / "data" / "faust_r"
+CURVE = (1, 2, 5, 10)  # % of sqrt(area)
+PUBLISHED = "| ULRSSM (Cao et al. 2023), trained on FAUST and SCAPE, 080 to 099 | | 1.6 | | | |"
+
+
+def faust_r(n):
+    """The first shapes of FAUST_r: meshes by name, and vertices (5000,) that correspond."""
+    meshes, true = {}, {}
+    for file in sorted(DATA.glob("*.npz"))[:n]:
+        with np.load(file) as kept:
+            true[file.stem] = kept["corres"]
+            meshes[file.stem] = kept["vertices"].astype(float), kept["faces"]
+    return meshes, true
+
+
+def shrec19(folder):
+    """Yield pairs of SHREC'19: both meshes, vertices of the first, true vertices of the second.
+
+    As its ``1_compute_curves.m`` reads them: ``PAIRS_list_SHREC19_connectivity.txt`` has a pair of
+    numbers in a line; ``mat/I.mat`` has a struct ``M`` with ``VERT`` and ``TRIV``, and the vertices
+    ``smpl_matches`` at which errors count; line v of ``FARMgt_txt/I_J.txt`` is the vertex of J for
+    vertex v of I.  All indices begin with 1.
+    """
+    pairs = np.loadtxt(folder / "PAIRS_list_SHREC19_connectivity.txt", delimiter=",", dtype=int)
+    for i, j in pairs:
+        files = [scipy.io.loadmat(folder / "mat" / f"{n}.mat", squeeze_me=True) for n in (i, j)]
+        source, target = ((f["M"]["VERT"].item(), f["M"]["TRIV"].item() - 1) for f in files)
+        at = files[0]["smpl_matches"] - 1
+        image = np.loadtxt(folder / "FARMgt_txt" / f"{i}_{j}.txt", dtype=int) - 1
+        yield f"{i} to {j}", source, target, at, image[at]
+
+
+def paths(X, T):
+    """Lengths of shortest paths between all vertices, in % of sqrt(area)."""
+    size = np.sqrt(triangle_areas(X, T).sum())
+    return 100 * dijkstra(edge_graph(X / size, edges(T)))
+
+
+def errors(distance, X, position, true):
+    """Errors of mapped positions, each moved to the nearest vertex."""
+    return distance[true, cKDTree(X).query(position)[1]]
+
+
+def mapped(study, source, points, targets=None):
+    """Images of points of one shape on others, by name."""
+    marks = dataset(landmark_position=points, landmark_name=np.arange(len(points)).astype(str))
+    found = s4a.transfer_landmarks(study, marks, source=source, targets=targets)
+    return {name: node["landmark_position"].values for name, node in found.children.items()}
+
+
+def alone(source, target, points):
+    """Images of points of one shape on another, matched alone."""
+    meshes = s4a.read_shapes({"source": source, "target": target}, compare=False)["original"]
+    first, second = (meshes[name].to_dataset() for name in ("source", "target"))
+    study = s4a.register_pairs(first, {"target": second}, name="source", n_jobs=1)
+    return mapped(study, "source", points)["target"]
+
+
+def row(name, rows, seconds):
+    """Print a row of the table: mean error, that of the worst pair, accuracy curve, CPU time."""
+    means, every = [np.mean(values) for values in rows], np.concatenate(rows)
+    curve = " ".join(f"{100 * np.mean(every <= share):.1f}" for share in CURVE)
+    cells = name, len(rows), f"{np.mean(means):.2f}", f"{max(means):.2f}", curve, f"{seconds:.0f}"
+    sys.stdout.write("| " + " | ".join(map(str, cells)) + " |\n")
+    sys.stdout.flush()
+
+
+def report_faust(n, n_pairs, seed):
+    """Print the rows of FAUST_r."""
+    meshes, true = faust_r(n)
+    points = {name: X[true[name]] for name, (X, _) in meshes.items()}
+    begin = time.process_time()
+    study = s4a.analyse(meshes, n_jobs=1, include_flagged=True)
+    images = {name: mapped(study, name, points[name]) for name in meshes}
+    seconds = time.process_time() - begin
+    chosen = list(itertools.permutations(meshes, 2))
+    np.random.default_rng(seed).shuffle(chosen)
+    chosen = [tuple(pair) for pair in chosen[:n_pairs]]
+    within, same, single, spent = [], [], [], 0.0
+    for target, (X, T) in meshes.items():
+        distance = paths(X, T)
+        for source in set(meshes) - {target}:
+            within.append(errors(distance, X, images[source][target], true[target]))
+            if (source, target) in chosen:
+                same.append(within[-1])
+                begin = time.process_time()
+                image = alone(meshes[source], meshes[target], points[source])
+                spent += time.process_time() - begin
+                single.append(errors(distance, X, image, true[target]))
+    row(f"one study of {n} shapes", within, seconds)
+    if chosen:
+        row("the same study, the pairs below", same, seconds)
+        row("pairs alone", single, spent)
+
+
+def report_shrec19(folder, n_pairs):
+    """Print a row for each pair of SHREC'19."""
+    for name, source, target, at, true in itertools.islice(shrec19(folder), n_pairs):
+        begin = time.process_time()
+        image = alone(source, target, source[0][at])
+        seconds = time.process_time() - begin
+        row(name, [errors(paths(*target), target[0], image, true)], seconds)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--shapes", type=int, default=20)
+    parser.add_argument("--pairs", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--shrec19", type=Path, metavar="FOLDER")
+    args = parser.parse_args()
+    shares = ", ".join(map(str, CURVE))
+    head = "pairs", "mean error", "worst pair", f"% of points within {shares} %", "CPU s"
+    sys.stdout.write(f"| | {' | '.join(head)} |\n|{' --- |' * (len(head) + 1)}\n")
+    if args.shrec19:
+        report_shrec19(args.shrec19, args.pairs)
+        return
+    report_faust(args.shapes, args.pairs, args.seed)
+    sys.stdout.write(PUBLISHED + "\n")
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")
+    main()
