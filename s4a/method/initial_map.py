@@ -48,6 +48,7 @@ class _InitialMap(NamedTuple):
     landmarks: tuple[Array, Array] | None = None  # of source and target, with init="landmarks"
     descriptors: tuple[Array, Array] | None = None  # of source and target, with init="landmarks"
     energies: Array | None = None  # both terms of the fit to them
+    score: float = 1.0  # of best_initial_maps
     others: tuple["_InitialMap", ...] = ()  # maps of a search that may be better
 
     def fit_to_landmarks(self, keep_descriptors: bool) -> xr.Dataset:
@@ -160,7 +161,7 @@ def stretch(target: Basis, X: Array) -> float:
 
 def best_initial_maps(
     source: Basis, target: Basis, C: Array, fitted: Array | None = None, *, search: bool = False
-) -> list[tuple[str, Array, Array]]:
+) -> list[tuple[str, Array, Array, float]]:
     """Return the best of the map from ICP and maps fitted to heat and wave kernels.
 
     If both shapes have landmarks, also a map fitted to wave kernels around these.  No descriptor
@@ -183,11 +184,11 @@ def best_initial_maps(
         Whether to continue with :func:`paired_extremities` and :data:`SEARCHED` until the first two
         terms of a score are below 0.07, or below 0.1 and two other maps agree with the best.  If
         none is, up to four maps that differ, with scores within 1.25 times the best, are returned:
-        their registrations at full resolution separate them better than the score here.
+        their registrations at full resolution decide.
 
     Returns
     -------
-    list of (name, C, fitted)
+    list of (name, C, fitted, score)
         The best first.  The name is "icp", "marked", "hks" or "wks", or from the search
         "extremities 1" or "hks+wks, curvature, k 10, oriented 1".  C and fitted ``(k_init,
         k_init)`` are the map after and before the step of ZoomOut.
@@ -212,8 +213,10 @@ def best_initial_maps(
         scored.sort(key=lambda row: row.score)
         n_agreed = sum(_distance(row, scored[0], target) < _AGREE for row in scored)
         if len(scored) >= 2 + len(maps) and best < (_MAX_AGREED if n_agreed > 2 else _MAX_SCORE):
-            return [scored[0].candidate]
-    return [row.candidate for row in (_leaders(scored, target) if search else scored[:1])]
+            search = False
+            break
+    best_ones = _leaders(scored, target) if search else scored[:1]
+    return [(*row.candidate, row.score) for row in best_ones]
 
 
 def _distance(one, other, target):
@@ -355,7 +358,9 @@ def initial_map(
     if not (differ and _have_signatures(source, target, len(initial.C))):
         return initial
     best, *others = (
-        _InitialMap(*candidate, initial.near)
-        for candidate in best_initial_maps(source, target, initial.C, initial.fitted, search=search)
+        _InitialMap(*candidate, initial.near, score=score)
+        for *candidate, score in best_initial_maps(
+            source, target, initial.C, initial.fitted, search=search
+        )
     )
     return best._replace(others=tuple(others))

@@ -159,13 +159,13 @@ def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dat
     given: dict[str, Any] = {"k_init": k_init, "init": options.init, "alignment": options.alignment}
     given["initial_refinement"] = options.initial_refinement == "always"
     initial = initial_map(M, N, transform, search=True, **given)
-    # of several initial maps the one is used whose registration has the lowest score
+    # of several initial maps the one with the lowest product of its score and the final one
     registration, C, kept, initial = min(
         (
             (*_complete(source, target, one, transform, k, options), one)
             for one in (initial, *initial.others)
         ),
-        key=lambda found: found[0].attrs["score"],
+        key=lambda found: found[0].attrs["score"] * found[-1].score,
     )
     if aligned.ambiguity:
         log.warning("%s", aligned.ambiguity)

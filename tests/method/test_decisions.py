@@ -219,9 +219,9 @@ def test_of_maps_with_similar_scores_those_that_differ_are_registered_and_the_be
     with monkeypatch.context() as patch:
         patch.setattr(spectral_icp, "registration_score", lambda *_: next(scores))
         found = initial_map.best_initial_maps(surface, surface, C, search=True)
-    assert [name for name, *_ in found] == ["first", "second"]
+    assert [(name, score) for name, _, _, score in found] == [("first", 0.2), ("second", 0.22)]
     near = np.arange(len(surface.X))
-    first, second = (initial_map._InitialMap(*one, near) for one in found)
+    first, second = (initial_map._InitialMap(*one, near, score=score) for *one, score in found)
     monkeypatch.setattr(pair, "initial_map", lambda *_, **__: first._replace(others=(second,)))
     mesh = synthetic.brains(1, 400)["original/brain_01"].to_dataset()
     options = {"n_coarse": 300, "k": 10, "k_init": 10, "refine": "intrinsic"}
