@@ -35,7 +35,8 @@ SHORT = 60  # functions of the short ZoomOut before a map is scored
 _MAX_SCORE, _MAX_AGREED = 0.07, 0.1
 # mean distances of the matches of maps that agree, and of maps that differ, of sqrt(area)
 _AGREE, _DIFFER = 0.03, 0.1
-_N_BEST, _MARGIN = 4, 1.25  # of maps that are returned: number, largest score over the least
+# of maps that are returned: number, largest score and curvature difference over those of the best
+_N_BEST, _MARGIN, _CURVATURE_MARGIN = 4, 1.25, 1.1
 
 
 class _InitialMap(NamedTuple):
@@ -62,9 +63,10 @@ class _InitialMap(NamedTuple):
 
 
 class _Scored(NamedTuple):
-    """Candidate of a search: score, matched points ``(n_target, 3)``, and name, map and fit."""
+    """Candidate: score, its curvature difference, matched points ``(n_target, 3)``, and the map."""
 
     score: float
+    curvature: float
     X: Array
     candidate: tuple[str, Array, Array]
 
@@ -183,8 +185,9 @@ def best_initial_maps(
     search : bool
         Whether to continue with :func:`paired_extremities` and :data:`SEARCHED` until the first two
         terms of a score are below 0.07, or below 0.1 and two other maps agree with the best.  If
-        none is, up to four maps that differ, with scores within 1.25 times the best, are returned:
-        their registrations at full resolution decide.
+        none is, up to four maps that differ are returned, and their registrations at full
+        resolution decide.  Their scores are at most 1.25 times, and their curvature differences 1.1
+        times those of the best, which excludes symmetric flips.
 
     Returns
     -------
@@ -207,9 +210,9 @@ def best_initial_maps(
         score = spectral_icp.registration_score(source, target, match, target.moved_to(image))
         score += stretch(target, image)
         best = min(best, score)
-        if search:
-            score += _CURVATURE_WEIGHT * fmap.curvature_difference(source, target, match)
-        scored.append(_Scored(score, source.X[match], candidate))
+        curvature = fmap.curvature_difference(source, target, match) if search else 0.0
+        score += _CURVATURE_WEIGHT * curvature
+        scored.append(_Scored(score, curvature, source.X[match], candidate))
         scored.sort(key=lambda row: row.score)
         n_agreed = sum(_distance(row, scored[0], target) < _AGREE for row in scored)
         if len(scored) >= 2 + len(maps) and best < (_MAX_AGREED if n_agreed > 2 else _MAX_SCORE):
@@ -229,7 +232,8 @@ def _leaders(scored, target):
     leaders: list[_Scored] = []
     for row in scored:
         differs = all(_distance(row, other, target) > _DIFFER for other in leaders)
-        if differs and row.score < _MARGIN * scored[0].score:
+        alike = row.curvature <= _CURVATURE_MARGIN * scored[0].curvature  # no symmetric flip
+        if differs and alike and row.score < _MARGIN * scored[0].score:
             leaders.append(row)
     return leaders[:_N_BEST]
 
