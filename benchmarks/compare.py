@@ -521,14 +521,14 @@ def table_2(given=None, first=tuple(FIRST)):
                 cells = [f"{s:.1f}" for s in (*spent, spent.sum())]
                 gap = f"{100 * chamfer.sel(algorithm=way, dense_match=how).item():.4f}"
                 shape = found["median_shape"].sel(algorithm=way).item()
-                all_rows.append([way, what, how, gap, *cells, shape])
+                all_rows.append([way, what, NAMES[str(how)], gap, *cells, shape])
             distance = found["distance_to_limit"].sel(algorithm=way).values
             distances.append([way, what, *(f"{d:.4f}" for d in distance)])
         say(f"\nfirst maps: {what}")
         verdict_2(found)
     blocks = [block for block in found["block"].values if block != "load and clean"]
     say("")
-    head = ["", "initial maps", "way up", "Chamfer to the template", *blocks, "all", "median shape"]
+    head = ["", "initial maps", "method", "Chamfer to the template", *blocks, "all", "median shape"]
     markdown(all_rows, head)
     say("\nDistance to the limit shape (eq. 5):\n")
     markdown(distances, ["", "initial maps", *found["shape"].values])

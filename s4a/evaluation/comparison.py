@@ -164,7 +164,8 @@ def compare(
     kNN: nearest neighbour in space after rigid alignment.  ZO: from that match, ZoomOut at full
     resolution.  FMAP+ZO: functional map fitted on landmarks at full resolution, then ZoomOut.
     SCALABLE: the same in the space of :mod:`s4a.method.scalable`.  RE-MATCH: the same on the
-    low-resolution mesh, and eq. 4 with U Phi, as ``s4a.match_pair(..., preset="paper")``.
+    low-resolution mesh, and eq. 4 with U Phi, as ``s4a.match_pair(..., preset="paper")``.  All
+    methods share the rigid alignment of ``alignment="search"``.
 
     S4A adds three methods.  RE-MATCH refined: eigenfunctions of
     :mod:`s4a.method.refined_eigenfunctions` instead of U Phi, and the final iterations of ZoomOut

@@ -5,6 +5,7 @@ import pkgutil
 import re
 from pathlib import Path
 
+from matplotlib.figure import Figure
 from paths import DOCS, LESSONS, NOTEBOOKS, ROOT, TESTS, benchmark, script
 from PIL import Image
 
@@ -188,17 +189,17 @@ def test_every_picture_of_the_pages_is_drawn_by_a_command_and_the_film_is_small(
 def test_the_figures_of_the_paper_are_drawn_from_a_study(study_folder, tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "HERE", tmp_path)
     study = importlib.import_module("s4a").open_study(study_folder)
-    drawn = [
-        figures.twice(draw, f"figure_{i}", lambda preset: study, (11, 5))
-        for i, draw in enumerate((figures.pipeline, figures.components))
-    ]
-    for path in (*drawn, figures.variance(study)):
+    figure = Figure(figsize=(11, 7))
+    above, below = figure.subfigures(2)
+    figures.pipeline(above, study)
+    figures.components(below, study)
+    for path in (figures.write(figure, "figure_1"), figures.variance(study)):
         with Image.open(path) as picture:
             assert picture.width > 400
             assert len(picture.convert("RGB").getcolors(256)) > 20
     with Image.open(figures.film(study, n_frames=2)) as film:
         assert (film.n_frames, film.width) == (2, 720)
-    assert len([*tmp_path.iterdir()]) == 4, "not over the pictures of the pages"
+    assert len([*tmp_path.iterdir()]) == 3, "not over the pictures of the pages"
 
 
 def test_every_public_name_is_in_the_table_of_names():
