@@ -362,8 +362,8 @@ def initial_map(
     if not (differ and _have_signatures(source, target, len(initial.C))):
         return initial
     best, *others = (
-        _InitialMap(*candidate, initial.near, score=score)
-        for *candidate, score in best_initial_maps(
+        _InitialMap(name, C, fitted, initial.near, score=score)
+        for name, C, fitted, score in best_initial_maps(
             source, target, initial.C, initial.fitted, search=search
         )
     )
