@@ -35,19 +35,22 @@ SHORT = 60  # functions of the short ZoomOut before a map is scored
 _MAX_SCORE, _MAX_AGREED = 0.07, 0.1
 # mean distances of the matches of maps that agree, and of maps that differ, of sqrt(area)
 _AGREE, _DIFFER = 0.03, 0.1
-_N_REFINED, _MARGIN = 4, 1.25  # of maps that are refined: number, largest score over the least
+# of maps that are returned: number, largest score and curvature difference over those of the best
+_N_BEST, _MARGIN, _CURVATURE_MARGIN = 4, 1.25, 1.1
 
 
 class _InitialMap(NamedTuple):
     """Initial map of a directed pair, and the data to which it was fitted."""
 
-    name: str  # "dense", "landmarks", or the name of best_initial_map
+    name: str  # "dense", "landmarks", or a name of best_initial_maps
     C: Array  # (k_init, k_init)
     fitted: Array  # (k_init, k_init), before the step of ZoomOut
     near: Array  # (n_target,), nearest neighbours in space after the rigid transform
     landmarks: tuple[Array, Array] | None = None  # of source and target, with init="landmarks"
     descriptors: tuple[Array, Array] | None = None  # of source and target, with init="landmarks"
     energies: Array | None = None  # both terms of the fit to them
+    score: float = 1.0  # of best_initial_maps
+    others: tuple["_InitialMap", ...] = ()  # maps of a search that may be better
 
     def fit_to_landmarks(self, keep_descriptors: bool) -> xr.Dataset:
         """Return the terms of the fit to landmarks and, if asked for, the descriptors."""
@@ -60,9 +63,10 @@ class _InitialMap(NamedTuple):
 
 
 class _Scored(NamedTuple):
-    """Candidate of a search: score, matched points ``(n_target, 3)``, and name, map and fit."""
+    """Candidate: score, its curvature difference, matched points ``(n_target, 3)``, and the map."""
 
     score: float
+    curvature: float
     X: Array
     candidate: tuple[str, Array, Array]
 
@@ -157,9 +161,9 @@ def stretch(target: Basis, X: Array) -> float:
     return float(np.median(np.abs(np.log(after / before))))
 
 
-def best_initial_map(
+def best_initial_maps(
     source: Basis, target: Basis, C: Array, fitted: Array | None = None, *, search: bool = False
-) -> tuple[str, Array, Array]:
+) -> list[tuple[str, Array, Array, float]]:
     """Return the best of the map from ICP and maps fitted to heat and wave kernels.
 
     If both shapes have landmarks, also a map fitted to wave kernels around these.  No descriptor
@@ -181,16 +185,16 @@ def best_initial_map(
     search : bool
         Whether to continue with :func:`paired_extremities` and :data:`SEARCHED` until the first two
         terms of a score are below 0.07, or below 0.1 and two other maps agree with the best.  If
-        none is, up to four maps that differ are refined by ZoomOut and piecewise rigid iterations
-        with all functions, and the one with the lowest registration score is returned.
+        none is, up to four maps that differ are returned, and their registrations at full
+        resolution decide.  Their scores are at most 1.25 times, and their curvature differences 1.1
+        times those of the best, which excludes symmetric flips.
 
     Returns
     -------
-    name : str
-        "icp", "marked", "hks" or "wks", or from the search "extremities 1" or
-        "hks+wks, curvature, k 10, oriented 1".
-    C, fitted : float ndarray (k_init, k_init)
-        The map after and before the step of ZoomOut.
+    list of (name, C, fitted, score)
+        The best first.  The name is "icp", "marked", "hks" or "wks", or from the search
+        "extremities 1" or "hks+wks, curvature, k 10, oriented 1".  C and fitted ``(k_init,
+        k_init)`` are the map after and before the step of ZoomOut.
     """
     k = min(SHORT, source.k, target.k)
     maps = [("icp", C, C if fitted is None else fitted)]
@@ -206,17 +210,16 @@ def best_initial_map(
         score = spectral_icp.registration_score(source, target, match, target.moved_to(image))
         score += stretch(target, image)
         best = min(best, score)
-        if search:
-            score += _CURVATURE_WEIGHT * fmap.curvature_difference(source, target, match)
-        scored.append(_Scored(score, source.X[match], candidate))
+        curvature = fmap.curvature_difference(source, target, match) if search else 0.0
+        score += _CURVATURE_WEIGHT * curvature
+        scored.append(_Scored(score, curvature, source.X[match], candidate))
         scored.sort(key=lambda row: row.score)
         n_agreed = sum(_distance(row, scored[0], target) < _AGREE for row in scored)
         if len(scored) >= 2 + len(maps) and best < (_MAX_AGREED if n_agreed > 2 else _MAX_SCORE):
-            return scored[0].candidate
-    leaders = _leaders(scored, target) if search else scored[:1]
-    if len(leaders) > 1:
-        leaders.sort(key=lambda row: _refined_score(source, target, row.candidate[1]))
-    return leaders[0].candidate
+            search = False
+            break
+    best_ones = _leaders(scored, target) if search else scored[:1]
+    return [(*row.candidate, row.score) for row in best_ones]
 
 
 def _distance(one, other, target):
@@ -229,17 +232,10 @@ def _leaders(scored, target):
     leaders: list[_Scored] = []
     for row in scored:
         differs = all(_distance(row, other, target) > _DIFFER for other in leaders)
-        if differs and row.score < _MARGIN * scored[0].score:
+        alike = row.curvature <= _CURVATURE_MARGIN * scored[0].curvature  # no symmetric flip
+        if differs and alike and row.score < _MARGIN * scored[0].score:
             leaders.append(row)
-    return leaders[:_N_REFINED]
-
-
-def _refined_score(source, target, C):
-    """Registration score after ZoomOut and piecewise rigid iterations with all functions."""
-    match = fmap.zoomout(source, target, C, min(source.k, target.k))[1]
-    return spectral_icp.scored(
-        source, target, *spectral_icp.piecewise_spectral_icp(source, target, match)
-    ).score
+    return leaders[:_N_BEST]
 
 
 def _map_from_landmarks(source, target, k):
@@ -346,14 +342,14 @@ def initial_map(
 ) -> _InitialMap:
     """Compute an initial map: :func:`map_after_alignment`, or the best of several if poses differ.
 
-    :func:`best_initial_map` needs ``init="dense"`` and signatures.
+    :func:`best_initial_maps` needs ``init="dense"`` and signatures.
 
     Parameters
     ----------
     source, target, transform : see :func:`map_after_alignment`
     search : bool
-        See :func:`best_initial_map`; for single pairs, as Consistent ZoomOut corrects the maps of a
-        network.
+        See :func:`best_initial_maps`; for single pairs, as Consistent ZoomOut corrects the maps of
+        a network.
     alignment : {"search", "icp", "given"}
         Only the map after alignment is used if the pose is given, as others can be of other poses.
     **options
@@ -365,5 +361,10 @@ def initial_map(
     differ = initial.name == "dense" and spectral_icp.poses_differ(source, target, initial.near)
     if not (differ and _have_signatures(source, target, len(initial.C))):
         return initial
-    name, C, fitted = best_initial_map(source, target, initial.C, initial.fitted, search=search)
-    return _InitialMap(name, C, fitted, initial.near)
+    best, *others = (
+        _InitialMap(name, C, fitted, initial.near, score=score)
+        for name, C, fitted, score in best_initial_maps(
+            source, target, initial.C, initial.fitted, search=search
+        )
+    )
+    return best._replace(others=tuple(others))

@@ -298,19 +298,13 @@ def candidates(
     best = min(matches, key=lambda name: results[f"{name}+joint"].score)
     initial = source, target, matches[best]
     if articulated and all(poses_differ(source, target, match) for match in matches.values()):
-        add(f"{best}+parts", *piecewise_spectral_icp(*initial, k))
+        piecewise = coarse_spectral_icp(
+            *initial, k_initial=20, k=k, iterations=1, spectral=0.2, articulated=True
+        )
+        add(f"{best}+parts", *piecewise)
     elif min(candidate.score for candidate in results.values()) > max_score:
         add(f"{best}+joint+spectral", *coarse_spectral_icp(*initial, k=k, spectral=0.1))
     return results
-
-
-def piecewise_spectral_icp(
-    source: Basis, target: Basis, match: Array, k: int = 100
-) -> tuple[Array, Warp]:
-    """Piecewise rigid :func:`coarse_spectral_icp` with spectral coordinates, for other poses."""
-    return coarse_spectral_icp(
-        source, target, match, k_initial=20, k=k, iterations=1, spectral=0.2, articulated=True
-    )
 
 
 def finalists(candidates: dict[str, Candidate], *, margin: float) -> list[str]:

@@ -13,6 +13,7 @@ from s4a import coarsen, spectrum, synthetic
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.method import alignment, elastic, initial_map, latent, spectral_icp
 from s4a.method.shape import Basis, Shape
+from s4a.study import pair
 
 # ---- the score of a registration: round trip, distances in both directions, landmarks
 
@@ -200,24 +201,31 @@ def test_of_maps_with_equal_scores_the_one_that_preserves_curvatures_is_chosen(
         scores, differences = iter([0.10, 0.11, 0.5]), iter([0.1, 0.0, 0.0])
         monkeypatch.setattr(spectral_icp, "registration_score", lambda *_: next(scores))
         monkeypatch.setattr(initial_map.fmap, "curvature_difference", lambda *_: next(differences))
-        return initial_map.best_initial_map(surface, surface, C, search=search)[0]
+        return initial_map.best_initial_maps(surface, surface, C, search=search)[0][0]
 
     assert found(search=False) == "icp"
     assert found(search=True) == "other"
 
 
-@pytest.mark.parametrize(("score", "chosen"), [(0.22, "second"), (0.3, "first")])
-def test_of_maps_with_similar_scores_that_differ_the_better_one_after_refinement_is_chosen(
-    surface, monkeypatch, score, chosen
+def test_of_maps_with_similar_scores_those_that_differ_are_registered_and_the_best_is_used(
+    surface, monkeypatch
 ):
     C, flipped = np.eye(10), np.diag((-1.0) ** np.arange(10))
-    maps = ("first", flipped, flipped), ("second", C, C)
-    scores = iter([0.5, 0.2, score, 0.3, 0.1])  # the last two after refinement
+    maps = [("first", flipped, flipped), ("same", flipped, flipped), ("second", C, C)]
+    scores = iter([0.3, 0.2, 0.21, 0.22])
     monkeypatch.setattr(initial_map, "maps_from_signatures", lambda *_: iter(maps))
     monkeypatch.setattr(initial_map, "stretch", lambda *_: 0.0)
-    monkeypatch.setattr(spectral_icp, "registration_score", lambda *_: next(scores))
     monkeypatch.setattr(initial_map.fmap, "curvature_difference", lambda *_: 0.0)
-    assert initial_map.best_initial_map(surface, surface, C, search=True)[0] == chosen
+    with monkeypatch.context() as patch:
+        patch.setattr(spectral_icp, "registration_score", lambda *_: next(scores))
+        found = initial_map.best_initial_maps(surface, surface, C, search=True)
+    assert [(name, score) for name, _, _, score in found] == [("first", 0.2), ("second", 0.22)]
+    near = np.arange(len(surface.X))
+    first, second = (initial_map._InitialMap(*one, near, score=score) for *one, score in found)
+    monkeypatch.setattr(pair, "initial_map", lambda *_, **__: first._replace(others=(second,)))
+    mesh = synthetic.brains(1, 400)["original/brain_01"].to_dataset()
+    options = {"n_coarse": 300, "k": 10, "k_init": 10, "refine": "intrinsic"}
+    assert pair.match_pair(mesh, mesh, **options).attrs["initial_map"] == "second"
 
 
 def test_three_maps_that_agree_end_a_search(surface, monkeypatch):
@@ -226,4 +234,4 @@ def test_three_maps_that_agree_end_a_search(surface, monkeypatch):
     monkeypatch.setattr(initial_map, "stretch", lambda *_: 0.0)
     monkeypatch.setattr(spectral_icp, "registration_score", lambda *_: next(scores))
     monkeypatch.setattr(initial_map.fmap, "curvature_difference", lambda *_: 0.0)
-    assert initial_map.best_initial_map(surface, surface, C, search=True)[0] == "icp"
+    assert initial_map.best_initial_maps(surface, surface, C, search=True)[0][0] == "icp"

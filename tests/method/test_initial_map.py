@@ -105,7 +105,7 @@ def test_shapes_in_one_pose_keep_their_initial_map(monkeypatch):
     def refuse(*_):
         raise AssertionError
 
-    monkeypatch.setattr(initial_map, "best_initial_map", refuse)
+    monkeypatch.setattr(initial_map, "best_initial_maps", refuse)
     assert match_pair(source, target, n_coarse=600, k=40).attrs["initial_map"] == "dense"
 
 
@@ -117,7 +117,7 @@ def test_poses_differ_only_if_no_rigid_transform_aligns_the_shapes(shapes):
 
 def test_of_initial_maps_the_best_is_chosen(shapes):
     low = shapes[0].low
-    name, C, _ = initial_map.best_initial_map(low, low, np.diag((-1.0) ** np.arange(20)))
+    (name, C, *_), *_ = initial_map.best_initial_maps(low, low, np.diag((-1.0) ** np.arange(20)))
     assert name in ("hks", "wks")
     assert np.diag(C).min() > 0.9
 
@@ -131,8 +131,8 @@ def test_a_search_continues_with_signatures_and_curvature_until_a_map_fits(shape
         return fit(*ends, curvature=curvature, **options) if curvature else turned_over
 
     monkeypatch.setattr(initial_map.fmap, "fmap_from_descriptors", spoilt)
-    assert np.diag(initial_map.best_initial_map(low, low, turned_over)[1]).min() < 0
-    name, C, fitted = initial_map.best_initial_map(low, low, turned_over, search=True)
+    assert np.diag(initial_map.best_initial_maps(low, low, turned_over)[0][1]).min() < 0
+    name, C, fitted, _ = initial_map.best_initial_maps(low, low, turned_over, search=True)[0]
     assert name == "hks+wks, curvature, k 10, oriented 1"
     assert np.diag(C).min() > 0.9
     assert C.shape == fitted.shape == (20, 20)
