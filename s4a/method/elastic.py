@@ -35,6 +35,7 @@ one implicit step of heat diffusion, (A + time W) d = A r.  The time decreases, 
 of MeshMonk (White et al., Scientific Reports 2019).  Landmarks add their squared distances.
 """
 
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,6 +43,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
+from s4a.geometry.align import rigid_transform
 from s4a.geometry.closest import closest_point_in_star, features, interpolate
 from s4a.method.shape import Basis, common_fields, field_columns
 from s4a.method.spectral import Diffusion
@@ -82,10 +84,9 @@ DEFORMATION = Schedule(STIFFNESS, _N_FURTHER, 8, 1e-3)
 CONVERGENCE = Schedule(np.array([1e-2, 1e-3]), 0, 32, 1e-4)
 # with more tangential weight, for surfaces that slide onto themselves
 NO_SLIDING = DEFORMATION._replace(slide=(_LOCAL_SLIDE, _LOCAL_SLIDE))
-# share of sqrt(area), and multiple of the distance between initialisations: very stiff iterations
-# that lead farther away from all of them slide.  They move tori by 0.034 to 0.09, 3.6 to 4.6 times
-# that distance; brains, faces, skulls and vertebrae by 0.004 to 0.021, up to 2.7 times
-_MIN_SLIDING, _MIN_RATIO = 0.03, 2.0
+# very stiff iterations slide if they move the target farther than this share of sqrt(area), farther
+# than twice the distance between initialisations, and rigidly but for this share: docs/decisions.md
+_MIN_SLIDING, _MAX_NOT_RIGID = 0.05, 0.4
 Rows = Array | slice
 _ALL = slice(None)
 
@@ -414,9 +415,14 @@ def slides(target: Basis, warps: dict[str, Warp], converged: dict[str, Warp]) ->
     def distance(X, Y):
         return np.linalg.norm(X - Y, axis=1) @ target.area
 
-    apart = max(distance(X, Y) for X in starts for Y in starts)
-    moved = min(distance(X, Y) for X in starts for Y in ends)
-    return len(starts) > 1 and bool(moved > max(_MIN_SLIDING, _MIN_RATIO * apart))
+    moved, start, end = min(
+        ((distance(X, Y), X, Y) for X in starts for Y in ends), key=itemgetter(0)
+    )
+    apart = max(distance(X, start) for X in starts)
+    if len(starts) < 2 or moved < max(_MIN_SLIDING, 2 * apart):
+        return False
+    R, t, _ = rigid_transform(start, end, target.area)
+    return bool(distance(start @ R.T + t, end) < _MAX_NOT_RIGID * moved)
 
 
 def local_iterations(
