@@ -6,8 +6,10 @@ write to temporary folders is gone afterwards.
 """
 
 import os
+import sys
 import tempfile
 
+import numpy as np
 import pytest
 from small import OPTIONS
 
@@ -17,6 +19,11 @@ from s4a import analyse, coarsen, open_study, spectrum, synthetic
 # where no number of processes is given, commands use one: to start another takes as long as a small
 # study. Tests of several processes give their number
 os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
+
+# jsonschema, of nbformat, would make the grammar of addresses of it, for a second in every worker
+sys.modules["rfc3987_syntax"] = None
+# what a test reads, the system has, before it is on the disk
+os.fsync = lambda handle: None
 
 
 @pytest.fixture(scope="session")
@@ -97,6 +104,15 @@ def short_films(monkeypatch):
     monkeypatch.setattr(s4a, "write_film", lambda *what: film(*what, n_frames=2, width=100))
 
 
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Pages have pictures of a few pixels; those that are looked at have tests of their own."""
+    from s4a.show import page, pictures
+
+    for module in (page, pictures):
+        monkeypatch.setattr(module, "render", lambda *a, **options: np.zeros((2, 2, 4), np.uint8))
+
+
 def pytest_terminal_summary(terminalreporter):
     """Processor time and peak memory of every notebook that ran, and of all together."""
     reports = [r for kind in ("passed", "failed") for r in terminalreporter.getreports(kind)]
@@ -118,17 +134,11 @@ def pytest_terminal_summary(terminalreporter):
 
 
 # files that take long begin first, the longest before all, so that no worker waits for the other
-SLOW = ["notebooks", "browser", "site", "interruptions", "several", "complete", "panels_browser"]
-SLOW += [
-    "faults",
-    "widgets",
-    "scenes_browser",
-    "pages",
-    "release",
-    "growth",
-    "save_browser",
-    "kills",
-]
+SLOW = """
+notebooks browser site interruptions several pages complete properties widgets faults panels_browser
+pipeline scenes_browser quality_control study_files insert reflect leave_one_out cluster clean
+scalable_study landmarks labels asymmetry view subjects plausibility save_browser kills release
+""".split()
 
 
 def pytest_collection_modifyitems(items):

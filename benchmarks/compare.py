@@ -1,6 +1,8 @@
 """The paper's Table 1 and Table 2 on real and on synthetic shapes: docs/comparison.md's figures.
 
 With truth where there is any, beside pyFM.  Tables are printed as they stand in the page.
+``compare.py readings`` prints both tables as section 5.1 can be read, and ``latent`` Table 2 by the
+size of the latent basis; both run only if they are named.
 
 The real shapes are those of the shared data beside the checkout, or in a folder that
 ``--data FOLDER`` names, a folder of PLY files for each set; what is absent is skipped.  Times are
@@ -19,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 import s4a
@@ -41,9 +44,13 @@ CORRESPONDING = {"faust15k": 6890}  # of these only the first vertices correspon
 SETS = {"faces": 2, "faust15k": 2, "cats": 2, "kids": 1}  # pairs
 SHOWN = ("geodesic_error", "chamfer", "hausdorff", "dirichlet", "coverage", "bijectivity")
 MEASURED = ("chamfer", "hausdorff", "dirichlet", "coverage", "bijectivity")  # without truth
+PYFM = {"isometric": True, "weights": "linear_program", "n_latent": 90}  # its defaults
+LATENT = {"100, as many as K": {}, "90": {"n_latent": 90}, "50": {"n_latent": 50}}
+LATENT |= {"90, with all defaults of pyFM": PYFM}
 NAMES = {"fmap": "standard", "latent": "ours"}  # of the paper
 COMPARED = ("FMAP+ZO", "RE-MATCH", "RE-MATCH refined", "registered")  # on more pairs
 N_LANDMARKS = 10
+DISPLACED = (0, 0.1, 0.25, 0.5)
 LOOKED_AT = ("RE-MATCH", "registered", "registered surface")
 FAR_GAP = 3  # % of sqrt(area), full yellow in the picture
 BELOW = (150, 20)  # from where the part is seen that one head has and another has not
@@ -355,6 +362,7 @@ def readings(source, target, transform, match, reverse, functions=None):
         "source, image of the target (as printed)": (X, image),
         "target, image of the source": (Y, Y[reverse]),
         "aligned target, its image": (placed, image),
+        "aligned source, its image": (X @ R.T + t, Y[reverse]),
         "source, smoothed image (eq. 8)": (X, placed + smoothed(target, image - placed)),
         "the first at 6,000 vertices": [x[v[v >= 0]] for x, v in zip((X, image), low, strict=True)],
     }
@@ -377,8 +385,9 @@ def smoothed(space, d):
 
 def readings_of_pairs(given=None, methods=comparison.PAPER_METHODS, n_pairs=5):
     """Table 1 on real heads as it can be read: means of both distances over the pairs."""
-    found = {}
+    found, displaced = {}, []
     for _, pair, _ in pairs_of_heads(given, n_pairs):
+        displaced.append([neighbours_displaced(pair, share) for share in DISPLACED])
         for method in methods:
             one, transform = pair.run(method), pair.align_samples[0]
             ends = pair.source, pair.target, transform, one.match, one.reverse
@@ -386,14 +395,30 @@ def readings_of_pairs(given=None, methods=comparison.PAPER_METHODS, n_pairs=5):
                 found.setdefault(name, {}).setdefault(method, []).append(values)
     say(f"\nTable 1 as it can be read, Chamfer / Hausdorff distance, {n_pairs} pairs of heads\n")
     readings_table(found, methods)
+    say("\nkNN as printed, with the target displaced after alignment, in shares of sqrt(area)\n")
+    cells = [f"{chamfer:.2f} / {hausdorff:.1f}" for chamfer, hausdorff in np.mean(displaced, 0)]
+    markdown([["kNN", *cells]], ["displaced by", *DISPLACED])
+
+
+def neighbours_displaced(pair, share):
+    """Eq. 9 and 10 in % of kNN, as printed, with the aligned target displaced along x."""
+    (X, Y), (R, t) = (pair.source.X, pair.target.X), pair.align_samples[0]
+    match = cKDTree(X).query((Y - t) @ R + [share, 0, 0])[1]
+    gap = metrics.nearest_distances(X, X[match])[0]
+    return 100 * gap.mean(), 100 * gap.max()
+
+
+def meshes_of_heads(given=None):
+    """Ten real heads by name."""
+    with tempfile.TemporaryDirectory() as folder:
+        tree = s4a.read_shapes(files_of("heads", folder, given))
+        return {name: node.to_dataset() for name, node in tree["original"].children.items()}
 
 
 def readings_of_collection(given=None):
     """Table 2 on ten real heads as it can be read, with the paper's preset: means over shapes."""
-    with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
-        tree = s4a.read_shapes(files_of("heads", folder, given))
-        meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
-        found = {}
+    meshes, found = meshes_of_heads(given), {}
+    with threadpool_limits(1):
         for method in comparison.COLLECTION_METHODS:
             one = comparison.latent_collection(meshes, method, 0.0, paper_options())
             for how in comparison.DENSE_MATCHES:
@@ -403,6 +428,19 @@ def readings_of_collection(given=None):
                         found.setdefault(name, {}).setdefault(column, []).append(pair)
     say("\nTable 2 as it can be read, Chamfer / Hausdorff distance, ten heads\n")
     readings_table(found, list(next(iter(found.values()))))
+
+
+def latent_sizes(given=None):
+    """Table 2 on ten real heads by RE-MATCH, by the size of the latent basis."""
+    meshes, rows = meshes_of_heads(given), []
+    for name, options in LATENT.items():
+        with threadpool_limits(1):
+            one = comparison.latent_collection(meshes, "RE-MATCH", 0.0, paper_options(**options))
+            gaps = [comparison.chamfer_to_template(one, how)[0] for how in comparison.DENSE_MATCHES]
+        cells = [f"{100 * np.nanmean(gap):.4f}" for gap in gaps]
+        rows.append([name, *cells, list(meshes)[one.template]])
+    say("\nChamfer distance to the template by the size of the latent basis, RE-MATCH\n")
+    markdown(rows, ["", *NAMES.values(), "median shape"])
 
 
 def readings_to_template(found, how):
@@ -419,10 +457,10 @@ def readings_to_template(found, how):
             yield readings(space, found.spaces[t], transform, match, reverse, functions)
 
 
-def paper_options():
-    """Options of Table 2 with the preset of the paper."""
+def paper_options(**others):
+    """Options of Table 2 with the preset of the paper, and others."""
     names = ("init", "n_samples", "dense_iterations", "alignment")
-    return Options(**{name: PRESETS["paper"][name] for name in names}, n_pairs=500, seed=0)
+    return Options(**{name: PRESETS["paper"][name] for name in names}, **others)
 
 
 def readings_table(found, columns):
@@ -516,7 +554,7 @@ def verdict_2(found):
         say(f"- {'holds' if holds else 'does not hold'}: {claim}")
 
 
-PARTS = ("registered", "more", "embedded", "collection", "heads", "readings")
+PARTS = ("registered", "more", "embedded", "collection", "heads", "readings", "latent")
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
@@ -554,3 +592,5 @@ if __name__ == "__main__":
         paper = [method for method in args.methods if method in comparison.PAPER_METHODS]
         readings_of_pairs(args.data, paper, args.pairs or 5)
         readings_of_collection(args.data)
+    if "latent" in args.parts and real:
+        latent_sizes(args.data)

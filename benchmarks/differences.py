@@ -290,12 +290,12 @@ times the size of the maps as defaults. Until its
 `PRESETS["paper"] | {{"isometric": True, "weights": "linear_program", "n_latent": 90}}`, and
 `"init": "wave_kernels"` for the fit. The preset keeps the equations as printed, which have no such
 steps. Tests compare `isometric` and the linear program (`tests/method/test_paper.py`) and the fit
-(`tests/method/test_descriptors.py`) with pyFM (pyfmaps 1.3.1). One difference is on purpose: around
+(`tests/method/test_descriptors.py`) with pyFM (pyfmaps 1.3.1). One difference is intended: around
 a cycle, pyFM 1.3.1 multiplies $C_{{ij}} C_{{jk}} C_{{ki}}$. As $C_{{ij}}$ maps functions from $i$
 to $j$, that product is not $I$ for consistent maps; S4A multiplies $C_{{ki}} C_{{jk}} C_{{ij}}$.
 
 With `isometric=True` the energies of eq. 5 are 11 to 28 times smaller on the brains and 32 to 63
-times on the faces (as they are in the model), since orthogonal maps have $D_i$ near $I$. The median
+times on the faces (with their common mesh), since orthogonal maps have $D_i$ near $I$. The median
 is brain_04 in place of brain_03, and identity006 in place of identity007. The match of eq. 7 moves
 by 0.19 and 0.12 % of the square root of the area on average.
 

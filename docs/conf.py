@@ -57,6 +57,9 @@ root_doc = "index"
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
+autodoc_use_type_comments = False  # there are none
+# functions in the contents of their page; a quarter of the time, so that a quick build has none
+toc_object_entries = os.environ.get("S4A_DOCS") != "off"
 napoleon_google_docstring = False
 napoleon_use_param = False  # types are words, not references
 napoleon_use_rtype = False

@@ -273,15 +273,15 @@ class Options:
     close_holes: bool = reading(False, "close each hole with a fan of triangles", of="cleaning")
     label: int | str | None = reading(None,
         "extract the surface of this label, or of the union of several (1,2), from label volumes "
-        "(NIfTI, MGH)",
+        "(NIfTI, MGH, NRRD)",
         check=check_label, of="cleaning", more='``"all"`` means every label but 0, see '
         ":func:`s4a.read_labels` for the formats.  By default the files are meshes")
     coordinate_system: str | None = reading(None,
-        "coordinate system of files that do not say theirs: RAS, LPS or 'surface RAS, c_ras X Y Z'",
+        "coordinate system of files that state none: RAS, LPS or 'surface RAS, c_ras X Y Z'",
         of="cleaning", pair=True, more="Files of different systems are converted to the most "
         "frequent one if all are known, and refused otherwise "
-        "(:mod:`s4a.input.coordinates`).  What a file says is never replaced")
-    unit: str | None = reading(None, "unit of files that do not say theirs: um, mm, cm, m or in",
+        "(:mod:`s4a.input.coordinates`).  What a file states is never overridden")
+    unit: str | None = reading(None, "unit of files that state none: um, mm, cm, m or in",
         check=check_unit, of="cleaning", pair=True)
     reflect: str | list[str] | None = reading(None,
         "shapes to mirror: names separated by commas, COLUMN=VALUE of the table, or 'auto'",
@@ -327,7 +327,7 @@ class Options:
         "or, as in ReMatching, along the surface, with U from closest points in space (geodesic)",
         choices=("normals", "geodesic"), section="4.1, step 1", see="method/remesh",
         of="low resolution", pair=True,
-        more="Geodesic samples ignore curvature, and U then crosses thin walls")
+        more="Geodesic samples ignore curvature, and U can then cross thin walls")
     wrap: bool = network(False, "wrap the shapes in a watertight surface before remeshing",
         of="low resolution")
     refined_eigenfunctions: bool = network(False,
@@ -351,11 +351,13 @@ class Options:
         instead="ICP from the pose of the files", see="method/alignment", of="initial maps",
         pair=True,
         more="The search starts at the principal axes, so its result does not depend on the pose "
-        "of the files.  A shape that fits others alike in two poses is flagged.  Landmarks replace "
-        "the search and the pose from which plain ICP starts.  Use 'given' for aligned data")
+        "of the files.  A shape that fits others equally well in two poses is flagged.  Landmarks "
+        "replace the search and the pose from which plain ICP starts.  Use 'given' for aligned "
+        "data")
     init: str = network("dense",
-        "initial maps from nearest neighbours of all vertices (dense), from 10 landmarks, or as "
-        "in pyFM from wave kernels of the shapes and around these landmarks (wave_kernels)",
+        "initial maps from nearest neighbours of all vertices (dense), from 10 landmarks "
+        "(landmarks), or as in pyFM from wave kernels of the shapes and of these landmarks "
+        "(wave_kernels)",
         choices=("dense", "landmarks", "wave_kernels"), paper="landmarks",
         section="4.1, steps 3 and 4",
         instead="initial map fitted to 10 landmarks", see="method/initial_map", of="initial maps",
@@ -381,8 +383,8 @@ class Options:
     isometric: bool = network(False,
         "before each latent basis of Consistent ZoomOut, replace both maps of a pair by the more "
         "orthogonal one and its transpose, as pyFM does", section="4.2", see="method/latent",
-        more="The maps then preserve area, so the energies of eq. 5 are smaller.  In pyFM this is "
-        "``isometric`` of ``FMN.zoomout_refine``, which is True by default")
+        more="The maps are then closer to area-preserving, so the energies of eq. 5 are smaller.  "
+        "In pyFM this is ``isometric`` of ``FMN.zoomout_refine``, which is True by default")
     n_samples: int = network(N_SAMPLES,
         "number of farthest-point samples that Consistent ZoomOut matches; 0 for all vertices",
         paper=0, fast=500, section="eq. 3", instead="for all vertices in every iteration",

@@ -127,7 +127,7 @@ def write_slicer(
     landmarks : Dataset, optional
         Landmarks of the template, by default those of its file; transferred to all shapes.
     coordinate_system, unit : str, optional
-        Of shapes whose files do not say theirs.
+        For files that state none.
 
     Returns
     -------
@@ -172,7 +172,7 @@ def write_slicer(
     if unknown:
         log.warning(
             "the files of %d shapes, such as %s, do not say whether they are RAS or LPS; 3D Slicer "
-            "takes them as LPS; coordinate_system= says it",
+            "takes them as LPS; coordinate_system= sets it",
             len(unknown),
             unknown[0],
         )

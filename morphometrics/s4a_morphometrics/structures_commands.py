@@ -107,7 +107,7 @@ def named_label(text: str) -> tuple[str, str]:
 
 
 def _fail_on(add: Callable[..., Any]) -> None:
-    text = "end with exit code 3 if shapes are excluded, or if shapes are flagged or excluded"
+    text = "end with exit code 3 if shapes are excluded, or also if they are flagged"
     add("--fail-on", choices=("none", "excluded", "flagged"), default="none", help=text)
 
 

@@ -406,7 +406,7 @@ def test_modes_play_the_directional_part_first_and_have_its_share(partners):
     assert modes["pca"]["score"].values[:, 0].mean() == pytest.approx(1)
 
 
-def test_the_command_writes_tables_and_a_page(study_folder, tmp_path, capsys):
+def test_the_command_writes_tables_and_a_page(study_folder, tmp_path, capsys, no_pictures):
     out = tmp_path / "out"
     command = ["asymmetry", str(study_folder), "--permutations", "15", "--out", str(out)]
     assert cli.main(command) == 0

@@ -41,6 +41,10 @@ def brain(tree):
 @pytest.fixture(scope="module")
 def part(brain):
     """A brain without its rear 30 %, rotated."""
+    return part_of(brain)
+
+
+def part_of(brain):
     X, T = as_arrays(brain)
     X, T = cut(X, T, X[:, 1] > np.quantile(X[:, 1], 0.3))
     return X @ TURN.T + [5.0, 0, 0], T
@@ -276,14 +280,11 @@ def test_a_part_of_another_bone_is_refused_or_named(study, brain, caplog):
     assert "another kind" in caplog.text
 
 
-def test_the_command_writes_the_completed_mesh(study, part, tmp_path, capsys):
-    folder = tmp_path / "study"
-    names = list(study["original"].children)[:4]
-    analyse({n: study["original"][n].to_dataset() for n in names}, store=folder, **OPTIONS).close()
+def test_the_command_writes_the_completed_mesh(study_folder, meshes, tmp_path, capsys):
     file = tmp_path / "part.ply"
-    write_mesh(file, *part)
+    write_mesh(file, *part_of(meshes["brain_02"]))
     out = tmp_path / "out"
-    words = ["complete", str(folder), str(file), "--out", str(out), "--samples", "1"]
+    words = ["complete", str(study_folder), str(file), "--out", str(out), "--samples", "1"]
     assert cli.main(words) == 0
     said = capsys.readouterr().out
     assert "% of the template" in said
@@ -294,4 +295,5 @@ def test_the_command_writes_the_completed_mesh(study, part, tmp_path, capsys):
     ]
     with xr.open_dataset(out / "completed.nc") as written:
         assert written["present"].values.mean() == pytest.approx(0.7, abs=0.15)
-    assert cli.main(["complete", str(folder), str(out / "none.ply"), "--out", str(out)]) == 2
+    words = ["complete", str(study_folder), str(out / "none.ply"), "--out", str(out)]
+    assert cli.main(words) == 2

@@ -137,7 +137,7 @@ def test_size_that_was_taken_out_is_given_back():
         with_size(kept)
 
 
-def test_the_command_takes_a_region_and_a_nuisance(study_folder, tmp_path, capsys):
+def test_the_command_takes_a_region_and_a_nuisance(study_folder, tmp_path, capsys, no_pictures):
     table = tmp_path / "table.csv"
     with open(table, "w") as file:
         names = [path.stem for path in sorted((study_folder / "original").glob("*.nc"))]

@@ -73,7 +73,7 @@ def test_the_test_of_covariation_keeps_its_level_for_fields_of_noise():
     assert np.all(np.mean(found, axis=0) < 0.12)  # 0.05 and three standard errors
 
 
-def test_the_command_writes_results_and_a_page(tmp_path, capsys, study_folder):
+def test_the_command_writes_results_and_a_page(tmp_path, capsys, study_folder, no_pictures):
     folder = shutil.copytree(study_folder, tmp_path / "study")
     study, rng = open_study(folder), np.random.default_rng(0)
     meshes = study["original"].children.items()

@@ -160,7 +160,7 @@ def map_to_scan(
     study : DataTree
     name : str
     given : CoordinateSystem, optional
-        Says what the file does not.
+        For files that state none.
     unit : str
         Unit to convert to, if that of the file is known.
     """

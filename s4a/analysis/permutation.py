@@ -99,7 +99,7 @@ def design(x: np.ndarray, covariates: np.ndarray | None = None) -> tuple[np.ndar
         )
     factor = inflation(X, Z)
     if q < np.linalg.matrix_rank(X) or factor > MOST_INFLATED:
-        nearly = "" if factor > 1e12 else f" up to a variance inflation factor of {factor:.2g}"
+        nearly = "" if factor > 1e12 else f" (variance inflation factor {factor:.2g})"
         raise ValueError(
             f"the tested variable is a combination of the covariates{nearly}; omit one of them"
         )

@@ -40,10 +40,10 @@ def write_label_volumes(
     label : int array_like (vertex,), optional
         Labels of the template's vertices, not 0; by default those of its file.
     grid : path, optional
-        NIfTI or MGH volume that defines the voxel grid of every shape; by default the label volume
-        from which each shape was extracted, with its labelled voxels.
+        NIfTI, MGH or NRRD volume that defines the voxel grid of every shape; by default the label
+        volume from which each shape was extracted, with its labelled voxels.
     coordinate_system, unit : str, optional
-        Of shapes whose files do not say theirs (:mod:`s4a.input.coordinates`).
+        For files that state none (:mod:`s4a.input.coordinates`).
 
     Returns
     -------

@@ -85,7 +85,7 @@ def run(
     cluster : ADDRESS
         dask scheduler tcp://host:port, or local:N worker processes
     fail_on
-        end with exit code 3 if shapes are excluded, or if shapes are flagged or excluded
+        end with exit code 3 if shapes are excluded, or also if they are flagged
 
     Examples
     --------
@@ -384,7 +384,7 @@ def insert(
     reflect : NAMES
         new shapes to mirror: names separated by commas; or auto, those mirrored to the study
     fail_on
-        end with exit code 3 if shapes are excluded, or if shapes are flagged or excluded
+        end with exit code 3 if shapes are excluded, or also if they are flagged
     """
     tree = s4a.open_study(study)
     given = {"landmarks": landmarks, "reflect": reflect, "n_jobs": n_jobs} | system
@@ -430,7 +430,7 @@ def transfer(
         smooth the votes for labels over this multiple of the estimated match error; 0: not at all
         (default: 1; 0 with --preset paper)
     fail_on
-        end with exit code 3 if targets are excluded, or if targets are flagged or excluded
+        end with exit code 3 if targets are excluded, or also if they are flagged
     """
     if not (labels or source_landmarks):
         raise ValueError("nothing to transfer: give --labels FILE, --source-landmarks FILE or both")

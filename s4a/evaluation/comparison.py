@@ -555,11 +555,9 @@ def latent_collection(
     source, target, maps = initial_maps(bases, options)
     seconds = [load, time.process_time() - begin]
     samples = [basis.sample_vertices_of(options.n_samples) for basis in bases]
-    growth: dict[str, Any] = {
-        "step": options.step,
-        "samples": samples,
-        "dense_iterations": options.dense_iterations,
-    }
+    names_of_growth = "step", "n_latent", "weights", "isometric", "dense_iterations"
+    growth: dict[str, Any] = {name: getattr(options, name) for name in names_of_growth}
+    growth["samples"] = samples
     ends = source, target, k
     *_, Y, low = clock("latent", latent.consistent_zoomout, bases, maps, *ends, **growth)
     result = dataset(latent_basis=Y, latent_eigenvalue=low).assign_coords(shape=names)

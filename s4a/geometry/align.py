@@ -383,7 +383,7 @@ def poses(source: Cloud, target: Cloud) -> list[IcpResult]:
 
 
 def distinct(ends: list[IcpResult]) -> list[IcpResult]:
-    """Sort results of ICP by residual, and omit those within ``DISTINCT`` degrees of a better."""
+    """Sort results of ICP by residual; omit those within ``DISTINCT`` degrees of a better one."""
     chosen: list[IcpResult] = []
     for end in sorted(ends, key=residual_of):
         # the trace of a rotation is 1 + 2 cos(angle)
@@ -404,7 +404,7 @@ def align(source: Cloud, target: Cloud) -> IcpResult:
 
     See Also
     --------
-    s4a.method.alignment.align_onto : Also detect poses that fit alike.
+    s4a.method.alignment.align_onto : Also detect equally good poses.
     rigid_transform : least-squares transform of corresponding points.
     """
     return poses(source, target)[0]

@@ -18,7 +18,7 @@ from s4a.input.subjects import listed
 MIRROR = np.array([-1.0, 1.0, 1.0])
 COMMON_SIDE, OTHER_SIDE = 0.8, 0.5  # least |mean chirality|: median of all shapes, of one shape
 # largest ICP residual of a mirror image, as a share of that of the shape: 0.7 to 0.8 for femurs of
-# the other side, 0.88 or more for nearly symmetric faces with meshes of their own
+# the other side, 0.87 or more for nearly symmetric faces with meshes of their own
 CLEARLY = 0.85
 AUTO = "auto"
 PLURAL = ("they are", "them", "all that are")

@@ -62,7 +62,7 @@ def read_shape(
         Read the file as a label volume, and return the surface of this label, see
         :func:`s4a.input.labels.read_volume`.
     coordinate_system, unit : str, optional
-        Used if the file does not say its own (:mod:`s4a.input.coordinates`).
+        For files that state none (:mod:`s4a.input.coordinates`).
 
     Returns
     -------
@@ -119,7 +119,7 @@ def as_mesh(shape: Mesh, what: str = "mesh") -> xr.Dataset:
 def as_meshes(shapes: dict[str, Mesh], options: Options) -> dict[str, xr.Dataset]:
     """Return meshes, or those of files, in one coordinate system if all are known.
 
-    The `options` say what the files do not.
+    The `options` are for files that state none.
     """
     given = options.coordinate_system, options.unit
     meshes = {n: with_system(as_mesh(one, n), *given) for n, one in shapes.items()}
@@ -157,7 +157,7 @@ def read_shapes(
     label : int, list of int, or "all", optional
         Read the files as label volumes, see :func:`read_labels`.
     coordinate_system, unit : str, optional
-        Of files that do not say theirs.  Shapes are converted to the most frequent system; if that
+        For files that state none.  Shapes are converted to the most frequent system; if that
         is not possible, none is converted, and a remark says so.
     compare : bool
         Compare each shape with the others in unit, chirality, form and genus

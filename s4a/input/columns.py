@@ -1,6 +1,6 @@
-"""Check of the columns of a table (6.1): codes of missing values, outliers, names that look alike.
+"""Check of the columns of a table (6.1): missing-value codes, outliers, names that look alike.
 
-Values are reported and never changed.  A test is refused where it would be meaningless.
+Values are reported and never changed.  A test is refused if it would be meaningless.
 """
 
 import logging
@@ -14,7 +14,7 @@ from s4a.input.subjects import is_plain_number, listed, look_alikes
 
 log = logging.getLogger(__name__)
 
-# -9, 99, -999, 9998 and alike, and the largest integers of 16 and 32 bits
+# -9, 99, -999, 9998 and similar, and the largest integers of 16 and 32 bits
 _CODES = re.compile(r"-1|-?(9*[789]|77+|88+|32768|2147483648)|32767|65535|2147483647")
 _WORDS = re.compile(
     r"[?.]+|none|unknown|missing|not? (available|data)|n\.a\.|n\.?d\.?|#.*[!?]", re.IGNORECASE
@@ -26,7 +26,7 @@ _LEVEL, _SLIP_LEVEL = 3e-4, 0.04  # of an outlier in a column; of a value ten ti
 def check_column(
     values: np.ndarray, names: Sequence[str], what: str, *, categories: bool = False
 ) -> None:
-    """Check a column before a test: codes of missing values, outliers, names that look alike.
+    """Check a column before a test: missing-value codes, outliers, names that look alike.
 
     Parameters
     ----------
@@ -42,9 +42,8 @@ def check_column(
     Raises
     ------
     ValueError
-        If a value is certainly a code of a missing value, an outlier has almost the whole variance
-        of the column, or two names differ only in characters that cannot be seen.  Other findings
-        are warnings.
+        If a value is certainly a missing-value code, one shape has almost the whole variance of the
+        column, or two names differ only in invisible characters.  Other findings are warnings.
 
     Examples
     --------
@@ -75,10 +74,10 @@ def _check_names(cells, names, what):
         text = f"{what}: {' and '.join(f'{cell!a} ({name})' for cell, name in example.items())} "
         if same:
             raise ValueError(
-                f"{text}look alike, and differ only in how their characters are stored, or in ones "
-                "that cannot be seen: write the same name for the same group"
+                f"{text}look alike, and differ only in encoding or invisible characters: write the "
+                "same name for the same group"
             )
-        log.warning("%sdiffer only in case or form: are these different groups?", text)
+        log.warning("%sdiffer only in case or similar letters: are these different groups?", text)
 
 
 def _check_numbers(x, names, what):
@@ -96,18 +95,18 @@ def _check_numbers(x, names, what):
         found = listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(far)])
         low, high = min(x[rest & ~far]), max(x[rest & ~far])
         text = f"{what}: outliers, {found} (others {low:.10g} to {high:.10g})"
-        others = np.delete(x[rest], abs(x[rest] - np.median(x[rest])).argmax())
-        share = 1 - others.var() * len(others) / (x[rest].var() * rest.sum())
+        remaining = np.delete(x[rest], abs(x[rest] - np.median(x[rest])).argmax())
+        share = 1 - remaining.var() * len(remaining) / (x[rest].var() * rest.sum())
         if share > _ALONE:
             raise ValueError(
-                f"{text}: {share:.1%} of the variance is of one shape, so that a test would "
+                f"{text}: {share:.1%} of the variance is of one shape, so a test would "
                 "compare it with all others: correct the value, or write NA"
             )
         log.warning("%s: correct the value, or write NA, if it is wrong; the test uses it", text)
 
 
 def _report_codes(codes, cells, names, what, others):
-    """Warn about codes of missing values, or ValueError if one is certain."""
+    """Warn about missing-value codes; ValueError if one is certain."""
     found = listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(codes)])
     if not found:
         return
@@ -122,7 +121,7 @@ def _report_codes(codes, cells, names, what, others):
 
 
 def missing_codes(x: np.ndarray) -> np.ndarray:
-    """Return a mask of numbers ``(n,)`` that are a usual code of missing values, and outlying.
+    """Return a mask of numbers ``(n,)`` that are usual missing-value codes, and outlying.
 
     Examples
     --------
@@ -144,12 +143,12 @@ def missing_codes(x: np.ndarray) -> np.ndarray:
 
 
 def _usual(x):
-    """Mask of the numbers that are usual codes."""
+    """Return a mask of the numbers that are usual codes."""
     return np.array([bool(_CODES.fullmatch(f"{value:.15g}")) for value in x])
 
 
 def _is_code(code, rest, count):
-    """Whether a usual code is one among the other values of its column, as it is far from them."""
+    """Return whether a usual code is far enough from the other values of its column to be one."""
     if abs(code) < 10 and rest.min() < 0:
         return False  # of differences
     low, high, decimals = rest.min(), rest.max(), (rest % 1 != 0).mean()

@@ -1,8 +1,8 @@
 """Coordinate systems of files (5.1, the data): read, compare and convert.
 
 A system has axes, an origin and a unit.  It is stored as the attributes ``coordinate_system``, a
-text such as those in :data:`EXAMPLES`, and ``unit``.  Everything that combines files asks
-:func:`transform`, which is None if what is needed is unknown.
+text such as those in :data:`EXAMPLES`, and ``unit``.  Code that combines files calls
+:func:`transform`, which returns None if the map is unknown.
 """
 
 import re
@@ -32,8 +32,8 @@ SURFACE, UNKNOWN = "surface", "unknown"
 XFORMS = {1: "scanner", 3: "Talairach", 4: "MNI152", 5: "template"}  # codes of NIfTI; 2 is world
 SPACES = {"SCANNER_ANAT": 1, "ALIGNED_ANAT": 2, "TALAIRACH": 3, "MNI_152": 4}  # of GIFTI
 REMEDY = (
-    "coordinate_system= and unit= say what a file does not; or save the files in one coordinate "
-    "system"
+    "set coordinate_system= and unit= for files that lack them, or save all files in one "
+    "coordinate system"
 )
 
 
@@ -113,7 +113,7 @@ class CoordinateSystem:
         return ", ".join(self.attrs.values()) if self.axes else f"unknown {self.unit}".strip()
 
     def filled(self, given: Self) -> Self:
-        """Return the system with what it leaves open as in another one."""
+        """Return the system, with unknown parts taken from another one."""
         unit, both = self.unit or given.unit, self.axes and given.axes
         is_open = self.origin == UNKNOWN or (
             self.origin == SURFACE == given.origin and not self.to_scanner
@@ -140,7 +140,7 @@ def transform(
     ----------
     source, target : CoordinateSystem
     origin : bool
-        False for axes and unit alone, for shapes that are aligned anyway.
+        False converts axes and unit only, for shapes that are aligned later.
 
     Examples
     --------
@@ -164,7 +164,7 @@ def transform(
 
 
 def map_to_ras(system: CoordinateSystem, *, placed: bool) -> np.ndarray:
-    """Return the map (4, 4) of a system to RAS in mm, if `placed` of the scanner."""
+    """Return the map (4, 4) of a system to RAS in mm, or to scanner RAS if `placed`."""
     M = np.eye(4)
     for row, ends in enumerate(("RL", "AP", "SI") if system.axes else ()):
         M[row, :3] = [{ends[0]: 1.0, ends[1]: -1.0}.get(axis, 0.0) for axis in system.axes]
@@ -192,7 +192,7 @@ def common(systems: Mapping[str, CoordinateSystem], *, origin: bool = False) -> 
     systems : dict of str to CoordinateSystem
         By the name of a file or shape.
     origin : bool
-        Positions are compared, not only shapes.
+        Whether the origin counts: positions are compared, not only shapes.
 
     Raises
     ------
@@ -203,9 +203,7 @@ def common(systems: Mapping[str, CoordinateSystem], *, origin: bool = False) -> 
     groups = {s: [n for n in own if own[n] == s] for s in own.values()}
     if any(transform(a, b) is None for a in groups for b in groups):
         texts = "; ".join(f"{system}: {', '.join(names[:6])}" for system, names in groups.items())
-        raise ValueError(
-            f"coordinate systems that convert to each other needed, found {texts}: {REMEDY}"
-        )
+        raise ValueError(f"convertible coordinate systems needed, found {texts}: {REMEDY}")
     return max(groups, key=lambda system: len(groups[system]), default=CoordinateSystem())
 
 
@@ -213,12 +211,12 @@ def common(systems: Mapping[str, CoordinateSystem], *, origin: bool = False) -> 
 
 
 def moved(X: np.ndarray, M: np.ndarray) -> np.ndarray:
-    """Apply an affine map (4, 4) to points ``(n, 3)``; the identity leaves every bit."""
+    """Apply an affine map (4, 4) to points ``(n, 3)``; the identity returns X itself."""
     return X if np.array_equal(M, np.eye(4)) else X @ M[:3, :3].T + M[:3, 3]
 
 
 def turned(T: np.ndarray, M: np.ndarray) -> np.ndarray:
-    """Return triangles ``(m, 3)`` in the order in which they face outward after a map (4, 4)."""
+    """Return triangles ``(m, 3)``, reversed if a map (4, 4) reflects, to face outward."""
     return np.ascontiguousarray(T[:, ::-1]) if np.linalg.det(M) < 0 else T
 
 
@@ -245,7 +243,7 @@ def with_system(mesh: xr.Dataset, coordinate_system: str | None, unit: str | Non
 
 
 def says_nothing(mesh: xr.Dataset) -> bool:
-    """Return whether a mesh is given in memory without axes and unit; it is never converted."""
+    """Return whether a mesh in memory has neither axes nor unit; it is never converted."""
     system = CoordinateSystem.of(mesh.attrs)
     return not (system.axes or system.unit or mesh.attrs.get("path"))
 

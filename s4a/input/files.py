@@ -101,7 +101,7 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
 def systems_of(shapes: Mapping[str, Any], given: CoordinateSystem) -> dict[str, CoordinateSystem]:
     """Return the coordinate systems of files and meshes by name, without unreadable files.
 
-    `given` says what they leave open.
+    `given` is for files that state none.
     """
     systems = {}
     for name, shape in shapes.items():
@@ -186,8 +186,8 @@ def write_mesh(
     points : float ndarray (n, 3)
     triangles : int ndarray (m, 3)
     coordinate_system, unit : str, optional
-        Written into the header, as 3D Slicer does, but for NPZ.  Coordinates in FreeSurfer's
-        surface RAS are converted to scanner RAS, and those of GIFTI to RAS and mm.
+        Written into the header, as by 3D Slicer, except for NPZ.  Coordinates in FreeSurfer's
+        surface RAS are converted to scanner RAS, and for GIFTI to RAS and mm.
     **vertex_scalars : float ndarray (n,)
         Values per vertex by name, in PLY, VTK, VTP, GIFTI (float32) and NPZ.
 

@@ -40,9 +40,9 @@ def locate(
 ) -> xr.Dataset:
     """Project landmarks to the closest points of a surface.
 
-    Landmarks are converted to the coordinate system of the mesh if both are known.  Otherwise they
-    are taken as given or as in RAS, LPS or the file of the mesh, whatever fits, with a warning if
-    they are not taken as given.
+    Landmarks are converted to the coordinate system of the mesh if both are known.  Otherwise the
+    interpretation that fits is used: as given, RAS, LPS or the system of the mesh file, with a
+    warning unless it is as given.
 
     Parameters
     ----------
@@ -102,12 +102,12 @@ def locate(
             f"{name!r} is {distance[worst]:.4g} away: is it of another mesh, unit "
             "or coordinate system (RAS, LPS)? Landmarks: "
             f"{CoordinateSystem.of(landmarks.attrs)}; mesh: {CoordinateSystem.of(mesh.attrs)}; "
-            "coordinate_system= and unit= say what a file does not"
+            "set coordinate_system= and unit= for files that lack them"
         )
     if is_guess or others:
         log.warning(
             "the coordinate system of the landmarks or of the mesh is unknown: %s fits, with at "
-            "most %.3g from the surface%s; coordinate_system= says it",
+            "most %.3g from the surface%s; coordinate_system= sets it",
             best,
             distance.max(),
             "".join(f", and {name} with {far[name]:.3g}" for name in others),
@@ -262,7 +262,7 @@ def with_landmarks(
     landmarks : Dataset or path
         A landmark file, or what :func:`s4a.input.annotations.read_landmarks` returns.
     coordinate_system, unit : str, optional
-        Used if the landmarks do not say theirs (:mod:`s4a.input.coordinates`).
+        For landmarks that state none (:mod:`s4a.input.coordinates`).
 
     Returns
     -------

@@ -401,16 +401,16 @@ KINDS = {
     "kind": (False, "outlier: {what} {deviations:.0f} robust deviations from the median; is it "
         "another kind of shape, stretched, or only a part? Remove it if it does not belong "
         "to the collection", "remove the files if they are of another kind"),
-    "pose": (True, "ambiguous pose: {number} poses fit alike (residual {best:.3f}, and rotated by "
-        "{angle:.0f} degrees {second:.3f} sqrt(area)); give landmarks=, or alignment='given' if "
+    "pose": (True, "ambiguous pose: {number} poses fit equally well (residual {best:.3f}, rotated "
+        "by {angle:.0f} degrees {second:.3f} sqrt(area)); give landmarks=, or alignment='given' if "
         "the files are aligned", "give --landmarks, or --alignment given if the files are aligned"),
     "registration": (True, "registration {sure} (score {registration_error:.3f}{distortion}): "
         "inspect it with s4a view, compare its file with the template's, or remove it",
         "look at the page; a larger --n-coarse may help"),
-    "influential": (False, "makes mode {component} almost alone: {percent:.0f} % of its sum of "
-        "squared scores, and the mode has {mode_percent:.1f} % of the variance: check size and "
+    "influential": (False, "dominates mode {component}: it has {percent:.0f} % of the sum of "
+        "squared scores, and the mode {mode_percent:.1f} % of the variance; check size and "
         "registration of the shape, and compare with the modes without it",
-        "it makes a mode of variation almost alone: check it"),
+        "it dominates a mode of variation: check it"),
     "near-copy": (False, "nearly the same shape as {other}: their distance is {percent:.1f} % of "
         "the usual distance between neighbours; keep one of them, if they are copies",
         "keep one file of each shape"),

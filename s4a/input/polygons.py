@@ -61,9 +61,9 @@ def strips(corners: np.ndarray, sizes: np.ndarray) -> Polygons:
 def triangulated(X: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, int]:
     """Triangulate polygons; those of fewer than three corners give no triangle.
 
-    A planar polygon is cut into triangles from its first corner, if none of them is folded over.
-    Otherwise it is cut from its vertex of the lowest index, or, if a triangle is then folded over,
-    by ear clipping.  Area and volume do not depend on which corner is the first.
+    A planar polygon becomes the triangle fan of its first corner, unless a triangle is folded over.
+    Otherwise the fan of its vertex of the lowest index is used or, if a triangle is then folded
+    over, ear clipping.  Area and volume do not depend on which corner is the first.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def triangulated(X: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple
 
 
 def _fans(P, rounding):
-    """Whether triangles from the first corner of polygons ``(q, c, 3)`` are folded over.
+    """Return whether fans of the first corner of polygons ``(q, c, 3)`` are folded over.
 
     Also whether the polygons are planar, up to the rounding of coordinates.
     """
@@ -168,7 +168,7 @@ def _turn(a, b, c):
 
 
 def _any_inside(triangle, points):
-    """Whether any of the points, other than the corners, is in a triangle or on its sides."""
+    """Return whether a triangle or its sides contain any of the points but its corners."""
     inside = np.ones(len(points), bool)
     for i in range(3):
         inside &= _turn(triangle[i - 1], triangle[i], points) > -_EPSILON

@@ -45,7 +45,7 @@ def _head_and_rows(path):
     for same, variants in look_alikes(head):
         if same:
             raise ValueError(f"{path}: columns need names that differ visibly; found {variants}")
-        log.warning("%s: names of columns differ only in case or form: %s", path, variants)
+        log.warning("%s: columns differ only in case or similar letters: %s", path, variants)
     ragged = [(line, row) for line, row in rows.items() if len(row) != len(head)]
     if ragged:
         line, row = ragged[0]

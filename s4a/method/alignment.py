@@ -1,8 +1,8 @@
-"""Rigid alignment of the shapes (4.1, step 2), and poses that fit alike.
+"""Rigid alignment of the shapes (4.1, step 2), and ambiguous poses.
 
 A pose of a shape is a rigid transform onto the reference.  Several are found by ICP from the
-principal axes.  Other shapes, which have a pose of their own, vote: the pose that fits the
-reference and all of them best is used, so that it closes the cycles of the network.
+principal axes.  Other aligned shapes vote: the pose that fits the reference and all of them best is
+used, so poses are consistent around the cycles of the network.
 """
 
 import itertools
@@ -33,22 +33,21 @@ from s4a.options import check
 from s4a.schema import POSE
 
 N_VOTERS = 6
-# poses fit alike if the root mean square residual to the voters is below ALIKE times that of the
-# best; or below NEARLY times, if one voter has the same residual but for SAME (of sqrt(area), root
-# of the difference of squares).  Shapes of a collection differ from each other by about 0.04.  With
-# fewer vertices than ENOUGH their spacing hides part of the difference: ALIKE is nearer to 1, and
-# NEARLY does not apply
+# poses are equally good if the root mean square residual to the voters is at most ALIKE times that
+# of the best; or NEARLY times, if it is the same for one voter but for SAME (of sqrt(area), root of
+# the difference of squares).  Shapes of a collection differ by about 0.04.  With fewer vertices
+# than ENOUGH their spacing hides part of the difference: ALIKE is lower, and NEARLY does not apply
 ALIKE, NEARLY, SAME, ENOUGH = 1.07, 1.2, 0.008, 400
 _COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
 IDENTITY = np.eye(3), np.zeros(3)
 
 
 class Alignment(NamedTuple):
-    """Rigid transform of a shape onto a reference, and the poses that fit alike."""
+    """Rigid transform of a shape onto a reference, and equally good poses."""
 
     R: np.ndarray  # (3, 3)
     t: np.ndarray  # (3,)
-    fits: tuple[float, ...] = (0.0,)  # residuals of the poses that fit alike, the best first
+    fits: tuple[float, ...] = (0.0,)  # residuals of equally good poses, the best first
     angle: float = 0.0  # degrees between the best and the second of them
 
     @property
@@ -58,7 +57,7 @@ class Alignment(NamedTuple):
 
     @property
     def ambiguity(self) -> str:
-        """Message on poses that fit alike; empty if there is only one."""
+        """Message on equally good poses; empty if there is only one."""
         if len(self.fits) < 2:
             return ""
         best, second, *_ = self.fits
@@ -67,7 +66,7 @@ class Alignment(NamedTuple):
 
 
 def less_confident(registration: xr.Dataset, n_poses: int) -> xr.Dataset:
-    """Divide the confidence of a registration by the number of poses that fit alike."""
+    """Divide the confidence of a registration by the number of equally good poses."""
     confidence = registration["confidence"]
     return registration.assign(confidence=confidence.copy(data=confidence.values / n_poses))
 
@@ -132,7 +131,7 @@ def alignment_residual(source: Basis, target: Basis, transform: RigidTransform) 
 def align_onto(
     source: Basis, target: Basis, alignment: str = "search", voters: Voters | None = None
 ) -> Alignment:
-    """Align a shape to a reference, and find the poses that fit alike.
+    """Align a shape to a reference, and find equally good poses.
 
     Parameters
     ----------
@@ -143,8 +142,8 @@ def align_onto(
     Returns
     -------
     Alignment
-        With one pose only if landmarks, ICP from one start or the pose of the files decide, or if
-        shapes are so different that rigid alignment decides nothing (:func:`poses_differ`).
+        With one pose only if landmarks or another `alignment` determine it, or if parts of the
+        shape are in another pose (:func:`s4a.method.spectral_icp.poses_differ`).
     """
     if alignment != "search" or from_landmarks(source, target):
         return Alignment(*transform_onto(source, target, alignment))
@@ -153,7 +152,7 @@ def align_onto(
 
 
 def ambiguity_of_reference(target: Basis, voters: Voters) -> Alignment:
-    """Find the poses of the reference itself that fit the other shapes alike."""
+    """Find poses in which the reference itself fits the other shapes equally well."""
     other, onto = next(iter(voters.values()))
     if from_landmarks(target, other):
         return Alignment(*IDENTITY)
@@ -198,7 +197,7 @@ def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Ali
 
 
 def _differs(source: Basis, voters: Voters, pose: RigidTransform) -> bool:
-    """Return whether the shape is in another pose of its parts than most voters."""
+    """Return whether parts of the shape are in another pose than those of most voters."""
     count = 0
     for other, onto in voters.values():
         R, t = relative_transform(pose, onto)

@@ -259,7 +259,7 @@ def latent_basis(
 def isometric_maps(C: Array, source: Array, target: Array) -> Array:
     """Replace both maps of each pair by the more orthogonal one and its transpose ``(p, k, k)``.
 
-    The maps of an isometry are orthogonal, and transposes of each other.  This is pyFM's reading of
+    The maps of an isometry are orthogonal, and transposes of each other.  This is pyFM's variant of
     Consistent ZoomOut (``FMN.set_isometries``).
 
     Parameters

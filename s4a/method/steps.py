@@ -340,8 +340,8 @@ def refine_network(
           ``median`` is the name of the median shape;
         - ``/iterations/k_020`` and so on, with `keep_iterations`: ``fmap``, ``latent_basis``,
           ``latent_eigenvalue`` and the matches of eq. 3 for every size of the maps:
-          ``matched_source`` of ``matched_target``, of all maps one after the other, as many of each
-          as ``matched_count(pair)`` says.
+          ``matched_source`` and ``matched_target`` of all maps one after the other, and their
+          number ``matched_count(pair)``.
 
     Raises
     ------

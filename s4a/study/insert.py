@@ -52,7 +52,7 @@ class Inserted(NamedTuple):
     Y: np.ndarray  # (k, m), latent basis
     registration: xr.Dataset
     comparison: xr.Dataset | None  # None if not compared
-    ambiguity: str  # message on several poses that fit alike
+    ambiguity: str  # message on equally good poses
 
 
 def insert(
@@ -87,7 +87,7 @@ def insert(
         Names of new shapes to mirror, separated by commas.  ``"auto"`` mirrors the shapes whose
         chirality is opposite to that of the study.  By default no shape is mirrored.
     coordinate_system, unit : str, optional
-        Of files that do not say theirs; by default as in the options of the study.  New shapes are
+        For files that state none; by default as in the options of the study.  New shapes are
         converted to the system of the study.
     compare : bool
         Compare each new shape with the study in unit, chirality, form and genus, and warn about

@@ -160,7 +160,7 @@ def exclude_flagged(
 
 
 def flag_poses(run: Run, aligned: Iterable[str], flags: Flags) -> Flags:
-    """Add flags to the shapes that fit the others alike in several poses."""
+    """Add flags to the shapes whose pose is ambiguous."""
     found = {n: attributes(run.folder / f"network/alignment_{n}.nc")["ambiguity"] for n in aligned}
     new = {name: [Flag(POSE, words, True)] for name, words in found.items() if words}
     return flags | {name: [*flags.get(name, []), *new[name]] for name in new}
@@ -185,9 +185,9 @@ def exclude_ambiguous(
     excluded = {n: coarse[n] for n in ambiguous if n != options.template}
     if 2 * len(excluded) >= len(coarse):
         remark = (
-            f"{len(ambiguous)} of {len(coarse)} shapes fit the others alike in several poses, too "
-            "many to exclude them; all are used, some perhaps in the wrong pose: give landmarks=, "
-            "or alignment='given' if the files are aligned"
+            f"{len(ambiguous)} of {len(coarse)} shapes fit the others equally well in several "
+            "poses, too many to exclude; all are used, some perhaps in the wrong pose: give "
+            "landmarks=, or alignment='given' if the files are aligned"
         )
         return flags, coarse, {}, [remark]
     return flags, {n: coarse[n] for n in coarse if n not in excluded}, excluded, []
@@ -241,7 +241,7 @@ def check_registrations(run: Run, registered: Keys, inserted: Keys) -> tuple[Fla
 
 
 def check_modes(pca: xr.Dataset, area: float) -> Flags:
-    """Warn about shapes that make a mode of variation alone, and about near copies.
+    """Warn about shapes that dominate a mode of variation, and about near copies.
 
     Parameters
     ----------

@@ -9,7 +9,8 @@ import xarray as xr
 from s4a import compare, compare_collection, synthetic
 from s4a.cli import main
 from s4a.evaluation import comparison
-from s4a.evaluation.methods import Spaces
+from s4a.evaluation.methods import Pair, Spaces
+from s4a.evaluation.metrics import nearest_distances
 from s4a.geometry.mesh import as_arrays
 from s4a.input.files import write_mesh
 
@@ -63,6 +64,20 @@ def test_every_method_has_every_metric_and_its_time_by_block(found):
 def test_nearest_neighbours_in_space_have_the_largest_chamfer_distance_of_the_papers(found):
     chamfer = found["chamfer"].sel(algorithm=list(comparison.PAPER_METHODS))
     assert (chamfer.idxmax("algorithm") == "kNN").all()
+
+
+def test_holes_in_the_image_of_nearest_neighbours_are_at_most_twice_the_distance_of_the_shapes(
+    three_brains,
+):
+    source, targets, _ = three_brains
+    pair = Pair(Spaces(source), Spaces(next(iter(targets.values()))))
+    X, Y, (R, t) = pair.source.X, pair.target.X, pair.align_samples[0]
+    image = X[pair.run("kNN").match]
+    holes, back = nearest_distances(X, image)
+    assert (holes <= 2 * nearest_distances(X @ R.T + t, Y)[0] + 1e-12).all()
+    assert (back == 0).all(), "the image has vertices of the source only"
+    nearest = nearest_distances(Y, X @ R.T + t)[0]
+    assert np.allclose(nearest_distances(Y, image @ R.T + t)[0], nearest)
 
 
 def test_maps_of_low_resolution_take_less_time_than_those_of_dense_meshes(found):

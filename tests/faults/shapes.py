@@ -307,7 +307,7 @@ FAULTS = [
           "not detected for nearly symmetric kinds",
           "reflect= mirrors it; or leave it out", where="warning"),
     Fault("shape upside down", "upside_down.ply", of(21, lambda X, T: (X * [1, -1, -1], T)), "ok",
-          "^$", "alignment starts from several rotations", "nothing to do"),
+          "^$", "alignment does not depend on the pose of the file", "nothing to do"),
     Fault("a part is cut off", "part.ply",
           of(30, lambda X, T: (X, T[(X[T, 2] < np.quantile(X[:, 2], 0.7)).all(axis=1)])),
           "flagged",

@@ -57,8 +57,12 @@ def test_signs_are_those_that_agree_with_most_pairs_whatever_their_order():
     assert permuted.tolist() == (true_sign * true_sign[order[0]])[order].tolist()
 
 
-def test_shapes_of_the_less_common_side_are_detected_with_clear_evidence(chiral):
-    comparisons = plausibility.examine(chiral, intersections=False)
+@pytest.fixture(scope="module")
+def comparisons(chiral):
+    return plausibility.examine(chiral, intersections=False)
+
+
+def test_shapes_of_the_less_common_side_are_detected_with_clear_evidence(comparisons):
     assert mirrored_shapes(comparisons) == (["s1", "s4"], [])
     mean = dict(zip(comparisons, mean_chirality(comparisons), strict=True))
     assert all(abs(value) > 0.8 for value in mean.values())
@@ -78,10 +82,9 @@ def test_mirror_symmetric_shapes_are_left_as_they_are_with_a_remark():
     assert "mirrored no shape: the shapes are too symmetric" in remark
 
 
-def test_a_shape_that_fits_as_well_as_it_is_is_not_mirrored(chiral):
-    comparisons = plausibility.examine(chiral, intersections=False)
+def test_a_shape_that_fits_as_well_as_it_is_is_not_mirrored(comparisons):
     alike = comparisons["s4"].assign(fit_mirrored=comparisons["s4"]["fit"])
-    comparisons |= {"s4": alike}
+    comparisons = comparisons | {"s4": alike}
     flags, _ = plausibility.find_warnings({name: {} for name in comparisons}, comparisons)
     assert [n for n in flags if "mirrored" in {flag.kind for flag in flags[n]}] == ["s1"]
     names, (remark,) = mirrored_shapes(comparisons)
@@ -89,8 +92,7 @@ def test_a_shape_that_fits_as_well_as_it_is_is_not_mirrored(chiral):
     assert "cannot determine the side of s4" in remark
 
 
-def test_a_shape_with_weak_evidence_is_named_and_left_as_it_is(chiral):
-    comparisons = plausibility.examine(chiral, intersections=False)
+def test_a_shape_with_weak_evidence_is_named_and_left_as_it_is(comparisons):
     weak = comparisons["s4"].assign(chirality=0.1 * comparisons["s4"]["chirality"])
     names, (remark,) = mirrored_shapes(comparisons | {"s4": weak})
     assert names == ["s1"]
@@ -135,13 +137,12 @@ def test_left_and_right_are_distinguished_in_all_pairs_of_six_femurs():
         n: plausibility.describe(mesh, intersections=False) for n, mesh in meshes.items()
     }
     is_left = {name: name.endswith("_l") for name in descriptors}
-    for name, descriptor in descriptors.items():
-        references = {n: descriptors[n] for n in descriptors if n != name}
-        comparison = plausibility.compare(name, descriptor, references)
-        for other in references:
+    comparisons = {n: plausibility.compare(n, data, descriptors) for n, data in descriptors.items()}
+    for name, comparison in comparisons.items():
+        for other in set(descriptors) - {name}:
             chirality = comparison["chirality"].sel(reference=other).item()
             assert (chirality > 0) == (is_left[name] == is_left[other])
             assert abs(chirality) > 1
-    names, remarks = mirrored_shapes(plausibility.examine(meshes, intersections=False))
+    names, remarks = mirrored_shapes(comparisons)
     assert names == [name for name in descriptors if is_left[name]]
     assert remarks == []

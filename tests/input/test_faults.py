@@ -130,7 +130,7 @@ def test_a_run_over_all_faults_ends_with_ten_good_shapes(in_python, checked, ran
     assert "genus 1: handle" in text
 
 
-def test_the_page_of_a_study_escapes_the_names_of_files(ran):
+def test_the_page_of_a_study_escapes_the_names_of_files(ran, no_pictures):
     html = study_html(ran[2].drop_nodes("pca"))  # which has no names of files, and many pictures
     assert "<img src=x" not in html
     assert "&lt;img src=x" in html

@@ -38,7 +38,7 @@ def test_nearly_symmetric_shapes_are_ambiguous_and_others_are_not():
     for aligned in align_all(near, "s1").values():
         assert len(aligned.fits) > 1
         assert aligned.angle > 150
-        assert "poses fit alike" in aligned.ambiguity
+        assert "poses fit equally well" in aligned.ambiguity
     for name, aligned in align_all(clear, "s1").items():
         true = Rotation.random(random_state=1).as_matrix()
         true = true @ Rotation.random(random_state=int(name[1])).as_matrix().T

@@ -11,7 +11,7 @@ import xarray as xr
 from s4a import synthetic
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.schema import dataset
-from s4a.show import draw, page, pictures
+from s4a.show import draw, page
 from s4a.show.surfaces import mode_limits
 
 K, N_SHAPES = 12, 6
@@ -101,13 +101,6 @@ def make_study(n=366):
 @pytest.fixture(scope="module")
 def study():
     return make_study()
-
-
-@pytest.fixture
-def no_pictures(monkeypatch):
-    """Draw nothing, where a test is about the text of a page."""
-    for module in (page, pictures):
-        monkeypatch.setattr(module, "render", lambda *a, **options: np.zeros((2, 2, 4), np.uint8))
 
 
 @pytest.fixture(scope="module")

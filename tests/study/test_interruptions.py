@@ -82,14 +82,18 @@ def remains(pid):
     ]
 
 
-@pytest.mark.parametrize("n_files", [0, 4], ids=["while they start", "in native code"])
+IN_NATIVE_CODE = 4  # files that are written when workers are there; none: while they start
+
+
 @pytest.mark.parametrize(
-    "how, who",
+    "how, who, n_files",
     [
-        (signal.SIGINT, os.kill),  # as from a notebook: the workers do not get it
-        (signal.SIGTERM, os.kill),
-        (signal.SIGKILL, os.kill),
-        (signal.SIGHUP, os.killpg),  # as when a terminal is closed
+        (signal.SIGINT, os.kill, 0),  # as from a notebook: the workers do not get it
+        (signal.SIGKILL, os.kill, 0),
+        (signal.SIGINT, os.kill, IN_NATIVE_CODE),
+        (signal.SIGTERM, os.kill, IN_NATIVE_CODE),
+        (signal.SIGKILL, os.kill, IN_NATIVE_CODE),
+        (signal.SIGHUP, os.killpg, IN_NATIVE_CODE),  # as when a terminal is closed
     ],
 )
 def test_workers_end_within_seconds_of_a_run_and_leave_nothing(files, tmp_path, how, who, n_files):

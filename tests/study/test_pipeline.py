@@ -410,9 +410,9 @@ def test_a_second_run_in_the_same_folder_is_refused(brains, study_folder):
 
 
 def test_the_registered_surface_is_four_times_more_accurate_than_nearest_neighbours():
-    tree = synthetic.brains(4, 8000)
+    tree = synthetic.brains(3, 5000)
     truth = tree["truth"]
-    result = analyse(tree, n_coarse=3000, n_jobs=1)
+    result = analyse(tree, n_coarse=2000, k=80, n_jobs=1)
     errors = accuracy.accuracy(
         result,
         lambda shape, template: synthetic.position(

@@ -162,7 +162,7 @@ def test_a_new_shape_is_inserted_as_in_the_study_of_the_others(alone, study, goo
     assert insert(study, {"new": (X / 1000, T)})["report"]["status"].item() == "flagged"
 
 
-def test_panels_and_page_mark_flagged_shapes(study):
+def test_panels_and_page_mark_flagged_shapes(study, no_pictures):
     tabs = explore(study)
     for title in tabs.tabs.titles:
         tabs[title]
@@ -240,7 +240,7 @@ def test_a_shape_that_makes_a_mode_alone_and_a_near_copy_are_named():
         large[2] += 1.0
         (one,) = check_modes(modes_of(large), 1.0)["s2"]
         assert (one.kind, one.flagged) == ("influential", False)
-        assert one.words.startswith("makes mode 1 almost alone: ")
+        assert one.words.startswith("dominates mode 1: ")
         copy[5] = copy[1] + 5e-4 * rng.normal(size=12)
         assert [*check_modes(modes_of(copy), 1.0)] == ["s1"]
         assert "nearly the same shape as s5" in check_modes(modes_of(copy), 1.0)["s1"][0].words
@@ -251,7 +251,7 @@ def test_a_shape_that_makes_a_mode_alone_is_in_the_summary(study):
     kinds = ["influential" if name == "brain_01" else "" for name in report["shape"].values]
     other = study.copy()
     other["report"] = xr.DataTree(report.assign(warning_kinds=("shape", kinds)))
-    assert "1 influential  brain_01  -> it makes a mode" in tables.run_summary(other)
+    assert "1 influential  brain_01  -> it dominates a mode" in tables.run_summary(other)
 
 
 def test_at_most_one_in_a_hundred_clean_collections_has_a_warning_of_its_modes():

@@ -33,7 +33,9 @@ def folder(mixed, tmp_path_factory):
     return folder
 
 
-def test_the_study_of_left_and_right_shapes_is_that_of_right_ones(right, mixed, folder):
+def test_the_study_of_left_and_right_shapes_is_that_of_right_ones(
+    right, mixed, folder, no_pictures
+):
     alone = analyse(right, **OPTIONS)
     named = analyse(mixed, reflect=LEFT, **OPTIONS)
     with open_study(folder) as result:

@@ -137,7 +137,7 @@ def test_it_is_as_near_to_the_truth_as_a_study_of_rematch(sampled, study_of_file
     assert ours < 0.7 * errors[0].sel(algorithm=accuracy.ICP).mean()
 
 
-def test_the_commands_take_it(folder, brain_files, sampled, tmp_path):
+def test_the_commands_take_it(folder, brain_files, sampled, tmp_path, no_pictures):
     assert main(["view", str(folder), "--page", str(tmp_path / "page.html")]) == 0
     assert SAMPLES in (tmp_path / "page.html").read_text(encoding="utf-8")
     few = ["--permutations", "9", "--out", str(tmp_path / "statistics")]
