@@ -490,7 +490,7 @@ def test_shapes_that_do_not_say_their_coordinates_are_not_written_into_a_scan(st
     label = np.ones(study["registration"].sizes["vertex"], int)
     options = {"label": label, "grid": tmp_path / "scan.nii"}
     with pytest.raises(
-        ValueError, match=r"unknown mm.* cannot be converted to RAS, mm: coordinate_"
+        ValueError, match=r"unknown mm.* cannot be converted to RAS, mm: set coordinate_"
     ):
         write_for(plain, tmp_path / "out", "nifti", **options)
     assert not (tmp_path / "out").exists()
