@@ -11,7 +11,10 @@ from paths import NOTEBOOKS, benchmark
 axe = pytest.importorskip("axe_playwright_python.sync_playwright")
 chromium = benchmark("chromium")
 needed = pytest.mark.skipif(chromium.PATH is None, reason=chromium.LACKS)
-HARMLESS = ("t.on is not a function", "Unsatisfied version")  # both are JupyterLab's own
+# JupyterLab's own; the last where cells run while its widget manager asks the kernel for all widgets
+HARMLESS = ("t.on is not a function", "Unsatisfied version", "widget model not found")
+READY = """[...window.jupyterapp.shell.widgets("main")].some(
+    (w) => "jupyter.widget" in (w.sessionContext?.session?.kernel?._targetRegistry ?? {}))"""
 VIEW = "canvas.s4a-view"
 DRAWN = f"[...document.querySelectorAll('{VIEW}')].some((c) => c.offsetParent && c.view.frames > 0)"
 SEEN = (
@@ -90,6 +93,7 @@ def run_notebook(page, lab, name):
     page.goto(f"{lab}/lab/tree/{name}?reset")
     page.wait_for_selector(".jp-Notebook .jp-Cell", timeout=120_000)
     page.wait_for_selector("text=Python 3 (ipykernel) | Idle", timeout=120_000)
+    page.wait_for_function(READY, timeout=120_000)  # else the first widgets are lost
     page.get_by_role("menuitem", name="Run", exact=True).click()
     page.get_by_role("menuitem", name="Run All Cells", exact=True).click()
 
