@@ -297,8 +297,8 @@ def register_pairs(
     Raises
     ------
     ValueError
-        If a shape has the name of the template, a mesh lacks a variable, or an option is out of
-        range or contradicts the preset.
+        If a shape has the name of the template, a mesh lacks a variable, the coordinate systems of
+        some meshes only are known, or an option is out of range or contradicts the preset.
 
     See Also
     --------

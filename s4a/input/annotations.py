@@ -16,11 +16,11 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from s4a.input.coordinates import CoordinateSystem, map_between, moved
+from s4a.input.coordinates import CoordinateSystem, map_between, moved, only
 from s4a.input.files import stem_of
 from s4a.input.formats import gifti_arrays, ply_properties
 from s4a.input.raw import check_there, content, npy, npz, reading, shown, text_of, xml
-from s4a.options import MILLIMETRES
+from s4a.options import MILLIMETRES, check_unit
 from s4a.schema import dataset, require, unit_of
 
 log = logging.getLogger(__name__)
@@ -349,18 +349,24 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
         elif re.match(r"\s*version\b", text, re.I):
             reader = _pts_points
         system, rows = (reader or _table_points)(text)
+        # name, position (None if it is not set), curve, closed
+        rows = [(str(row[0]) or str(i), *row[1:], "", False)[:4] for i, row in enumerate(rows, 1)]
+        unset = [name for name, position, *_ in rows if position is None]
+        if unset:
+            text = "%s: landmarks without a position are left out: %s"
+            log.warning(text, shown(path), shown(", ".join(unset)))
+        rows = [row for row in rows if row[1] is not None]
         sizes = {len(position) for _, position, *_ in rows}
         if sizes != {3}:
             raise ValueError(f"points of 3 coordinates needed, found {len(rows)} of {sizes or 0}")
-        # name, position, curve, closed
-        names, positions, curve, closed = zip(*((*row, "", False)[:4] for row in rows), strict=True)
+        names, positions, curve, closed = zip(*rows, strict=True)
         points = np.array(positions, float)
         if not np.isfinite(points).all():
             raise ValueError("points with finite coordinates needed")
         single = [name for name, count in Counter(curve).items() if name and count < 2]
         if single:
             raise ValueError(f"a curve needs at least two points; {single[0]!r} has one")
-        texts = short([str(name) or str(i + 1) for i, name in enumerate(names)])
+        texts = short(list(names))
         curves = short([str(name) for name in curve])
     data = {"landmark_name": np.array(texts), "landmark_position": points}
     if any(curves):
@@ -433,12 +439,9 @@ def _slicer_points(text):
             curve = m.get("name") or f"curve_{i}"
             curve = f"{curve}_{i}" if curve in taken else curve
             taken.add(curve)
-        points = m.get("controlPoints") or []  # a region of interest may have none
-        points = [p for p in points if p.get("positionStatus", "defined") == "defined"]
-        rows += [
-            (p.get("label", ""), p["position"], curve, m.get("type") == "ClosedCurve")
-            for p in points
-        ]
+        for p in m.get("controlPoints") or []:  # a region of interest may have none
+            position = p["position"] if p.get("positionStatus", "defined") == "defined" else None
+            rows.append((p.get("label", ""), position, curve, m.get("type") == "ClosedCurve"))
     # a unit may be a list of its code, the scheme of the code and its meaning
     units = {np.ravel(m.get("coordinateUnits") or "mm").tolist()[0] for m in lists}
     if len(units) != 1 or not units <= {*MILLIMETRES}:
@@ -447,9 +450,14 @@ def _slicer_points(text):
 
 
 def _meshlab_points(text):
-    points = [p for p in xml(text).iter("point") if p.get("active") != "0"]
-    rows = [(p.get("name", ""), [p.get(axis) for axis in "xyz"]) for p in points]
+    points = [(p, [p.get(axis) for axis in "xyz"]) for p in xml(text).iter("point")]
+    rows = [(p.get("name", ""), None if p.get("active") == "0" else x) for p, x in points]
     return CoordinateSystem(), rows
+
+
+_TRUE = ("1", "true", "yes")
+# values of points that have a position; numbers: 0 undefined, 1 preview, 2 defined, 3 missing
+_SET = {"positionstatus": ("", "2", "defined"), "defined": ("", *_TRUE)}
 
 
 def _table_points(text):
@@ -460,24 +468,23 @@ def _table_points(text):
     if columns.search(text):  # .fcsv of 3D Slicer, of old versions without a system, or with 0
         axes, unit = axes or "0", unit or "mm"
     attrs = {"coordinate_system": _AXES.get(axes, axes), "unit": unit}
-    system, rows = CoordinateSystem.of(attrs), table_rows(columns.sub("", text, count=1))
+    rows = table_rows(columns.sub("", text, count=1))
     header = next(iter(rows.values()))
     if columns.search(text) and len(header) == 14:
-        # 3D Slicer 5 adds two cells, of which the first is 2 for a point that has a position
-        rows = {n: row[:14] for n, row in rows.items() if row[14:15] in ([], [""], ["2"])}
+        header += ["positionstatus", "created"]  # of 3D Slicer 5, which does not name them
     head = [cell.lower() for cell in header]
-    name, curve, closed = None, None, None
+    name, curve, closed, status = None, None, None, None
     letters = next((axes for axes in ("xyz", "lps", "ras") if {*axes} <= {*head}), "")
     if letters:
         x = [head.index(axis) for axis in letters]
         name = next((head.index(n) for n in ("name", "label", "landmark") if n in head), None)
         curve, closed = (head.index(n) if n in head else None for n in ("curve", "closed"))
         del rows[next(iter(rows))]
-        if letters != "xyz":  # of 3D Slicer
-            system = CoordinateSystem(letters.upper(), "", "mm")
-        if "defined" in head:
-            at = head.index("defined")
-            rows = {line: row for line, row in rows.items() if row[at : at + 1] != ["0"]}
+        status = next((head.index(n) for n in _SET if n in head), None)
+        axes = "" if letters == "xyz" else letters.upper()  # of 3D Slicer
+        attrs |= {key: only(key, [attrs[key], *_column_of(key, head, rows)]) for key in attrs}
+        attrs["coordinate_system"] = only("coordinate_system", [attrs["coordinate_system"], axes])
+        attrs["unit"] = attrs["unit"] or ("mm" if axes else "")
     elif len(head) in (3, 4) and all(map(is_number, header[-3:])):
         x = list(range(len(head) - 3, len(head)))
         name = 0 if len(head) == 4 else None
@@ -488,9 +495,18 @@ def _table_points(text):
     points = []
     for line, row in rows.items():
         label, of_curve, is_closed = ("" if i is None else row[i] for i in (name, curve, closed))
-        position = [_number_of(row[i], line) for i in x]
-        points.append((label, position, of_curve, is_closed.lower() in ("1", "true", "yes")))
-    return system, points
+        is_set = status is None or "".join(row[status : status + 1]).lower() in _SET[head[status]]
+        position = [_number_of(row[i], line) for i in x] if is_set else None
+        points.append((label, position, of_curve, is_closed.lower() in _TRUE))
+    if attrs["unit"]:
+        check_unit(attrs["unit"])
+    return CoordinateSystem.of(attrs), points
+
+
+def _column_of(name, head, rows):
+    """Cells of a column, if there is one."""
+    at = head.index(name) if name in head else len(head)
+    return [row[at] for row in rows.values() if at < len(row)]
 
 
 def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:

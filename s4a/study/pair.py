@@ -84,7 +84,8 @@ def match_pair(
     Raises
     ------
     ValueError
-        If a mesh lacks variables, or an option is out of range or contradicts the preset.
+        If a mesh lacks variables, the coordinate system of one mesh only is known, or an option is
+        out of range or contradicts the preset.
 
     See Also
     --------
