@@ -281,22 +281,26 @@ def _text_labels(data):
             "one label for every vertex expected, found some vertices (a FreeSurfer label): "
             "convert it to .annot by mris_label2annot"
         )
-    rows = table_rows(text_of(data))
-    header = next(iter(rows.values()))
-    head = [cell.lower() for cell in header]
-    if len(head) > 1 and "label" not in head:
-        raise ValueError(f"a column 'label' needed, found {', '.join(header)}")
-    at, has_head = (head.index("label"), True) if "label" in head else (0, False)
-    cells = _cells(rows, at, has_head)
+    cells = _column(text_of(data), "label", str.lower, lambda head: head == "label")
     if all(map(is_number, cells.values())):
         return np.array([float(cell) for cell in cells.values()])
     return np.array(short(list(cells.values())))
 
 
-def _cells(rows, at, has_head):
-    """Cells of a column by line, in the order of the column ``vertex`` if there is one."""
-    n = len(next(iter(rows.values())))
-    head = [cell.lower() for cell in rows.pop(next(iter(rows)))] if has_head else []
+def _column(text, name, case, is_head):
+    """Cells of a column by line, in the order of the column ``vertex`` if there is one.
+
+    `case` changes the cells of the header; `is_head` says whether a single cell is one.
+    """
+    rows = table_rows(text)
+    header = next(iter(rows.values()))
+    head, n = [case(cell) for cell in header], len(header)
+    if n > 1 and name not in head:
+        raise ValueError(f"a column {name!r} needed, found {', '.join(header)[:80]}")
+    at = head.index(name) if n > 1 else 0
+    if n > 1 or is_head(head[0]):
+        del rows[next(iter(rows))]
+    head = [cell.lower() for cell in head]
     _check_cells(rows, n, 1 + at)
     lines = list(rows)
     if n > 1 and "vertex" in head:
@@ -429,9 +433,6 @@ def _slicer_points(text):
         for m in lists
         for p in (m, *(m.get("controlPoints") or []))
     }
-    if len(systems) != 1 or not systems <= {"LPS", "RAS"}:
-        names = ", ".join(sorted(systems)) or "no markups"
-        raise ValueError(f"one coordinateSystem, LPS or RAS, needed, found {names}")
     rows, taken = [], set()
     for i, m in enumerate(lists, 1):
         curve = ""
@@ -444,9 +445,13 @@ def _slicer_points(text):
             rows.append((p.get("label", ""), position, curve, m.get("type") == "ClosedCurve"))
     # a unit may be a list of its code, the scheme of the code and its meaning
     units = {np.ravel(m.get("coordinateUnits") or "mm").tolist()[0] for m in lists}
-    if len(units) != 1 or not units <= {*MILLIMETRES}:
-        raise ValueError(f"one of {', '.join(MILLIMETRES)} as unit needed, found {sorted(units)}")
-    return CoordinateSystem(systems.pop(), "", units.pop()), rows
+    return _system_of(systems, units), rows
+
+
+def _system_of(systems, units):
+    """Coordinate system of landmarks; ValueError if several are stated."""
+    system, unit = only("coordinate system", systems), only("unit", units)
+    return CoordinateSystem.of({"coordinate_system": system, "unit": unit and check_unit(unit)})
 
 
 def _meshlab_points(text):
@@ -467,7 +472,7 @@ def _table_points(text):
     axes, unit = (one[1] if one else "" for one in found)
     if columns.search(text):  # .fcsv of 3D Slicer, of old versions without a system, or with 0
         axes, unit = axes or "0", unit or "mm"
-    attrs = {"coordinate_system": _AXES.get(axes, axes), "unit": unit}
+    systems, units = [_AXES.get(axes, axes)], [unit]
     rows = table_rows(columns.sub("", text, count=1))
     header = next(iter(rows.values()))
     if columns.search(text) and len(header) == 14:
@@ -481,10 +486,11 @@ def _table_points(text):
         curve, closed = (head.index(n) if n in head else None for n in ("curve", "closed"))
         del rows[next(iter(rows))]
         status = next((head.index(n) for n in _SET if n in head), None)
-        axes = "" if letters == "xyz" else letters.upper()  # of 3D Slicer
-        attrs |= {key: only(key, [attrs[key], *_column_of(key, head, rows)]) for key in attrs}
-        attrs["coordinate_system"] = only("coordinate_system", [attrs["coordinate_system"], axes])
-        attrs["unit"] = attrs["unit"] or ("mm" if axes else "")
+        systems += _column_of("coordinate_system", head, rows)
+        units += _column_of("unit", head, rows)
+        if letters != "xyz":  # of 3D Slicer
+            systems.append(letters.upper())
+            units = units if any(units) else ["mm"]
     elif len(head) in (3, 4) and all(map(is_number, header[-3:])):
         x = list(range(len(head) - 3, len(head)))
         name = 0 if len(head) == 4 else None
@@ -498,9 +504,7 @@ def _table_points(text):
         is_set = status is None or "".join(row[status : status + 1]).lower() in _SET[head[status]]
         position = [_number_of(row[i], line) for i in x] if is_set else None
         points.append((label, position, of_curve, is_closed.lower() in _TRUE))
-    if attrs["unit"]:
-        check_unit(attrs["unit"])
-    return CoordinateSystem.of(attrs), points
+    return _system_of(systems, units), points
 
 
 def _column_of(name, head, rows):
@@ -841,7 +845,8 @@ def _values(data, file, name):
         return npy(data)
     if file.endswith(".gii"):
         return _gifti_vector(data, intent=None)
-    return _column(text_of(data), name)
+    cells = _column(text_of(data), name, str, lambda head: not is_number(head))
+    return np.array([_number_of(cell, line) for line, cell in cells.items()])
 
 
 def _curv(data):
@@ -855,13 +860,3 @@ def _curv(data):
             f"{len(data) - 15} bytes"
         )
     return np.frombuffer(data, ">f4", n, 15)
-
-
-def _column(text, name):
-    """Column of that name, or the only one."""
-    rows = table_rows(text)
-    head = next(iter(rows.values()))
-    if len(head) > 1 and name not in head:
-        raise ValueError(f"a column {name!r} expected, found {', '.join(head)[:80]}")
-    at, has_head = (head.index(name), True) if len(head) > 1 else (0, not is_number(head[0]))
-    return np.array([_number_of(cell, line) for line, cell in _cells(rows, at, has_head).items()])

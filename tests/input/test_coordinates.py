@@ -141,7 +141,7 @@ def test_a_file_that_states_two_coordinate_systems_is_refused(tmp_path):
     }
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(ValueError, match=r"one (SPACE|coordinate_system) .* LPS and RAS"):
+        with pytest.raises(ValueError, match=r"one (SPACE|coordinate system) .* LPS and RAS"):
             (read_landmarks if "csv" in name else read_mesh)(tmp_path / name)
     (tmp_path / "a.vtk").write_bytes(data.replace(b"%s", b"LPS"))
     assert read_mesh(tmp_path / "a.vtk")[2]["coordinate_system"] == "LPS"
@@ -331,7 +331,7 @@ def test_landmark_files_of_other_programs_are_read(tmp_path, caplog):
     (tmp_path / "a.mrk.json").write_text(MARKUPS % ('"LPS"', point))
     (tmp_path / "b.json").write_text("{}")
     wrong["b.json"] = "'markups' expected, found none"
-    wrong["a.mrk.json"] = "one coordinateSystem, LPS or RAS, needed, found LPS, RAS"
+    wrong["a.mrk.json"] = "one coordinate system expected, found LPS and RAS"
     for name, words in wrong.items():
         with pytest.raises(ValueError, match=words):
             read_landmarks(tmp_path / name)
