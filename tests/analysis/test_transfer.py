@@ -25,7 +25,7 @@ from s4a import (
     transfer_scalars,
     write_mesh,
 )
-from s4a.analysis.transfer import diffuse_votes, majority, pair_study, votes_of
+from s4a.analysis.transfer import diffuse_votes, majority, votes_of
 from s4a.geometry.closest import (
     closest_facing_point,
     closest_point,
@@ -43,6 +43,7 @@ from s4a.input.annotations import (
 from s4a.input.landmarks import locate
 from s4a.schema import dataset
 from s4a.study import quality_control
+from s4a.study.pair import pair_study
 
 OPTIONS = {"n_coarse": 1200, "k": 60}
 

@@ -19,6 +19,7 @@ from s4a.input.formats import vtk_bytes, vtp_bytes
 from s4a.input.landmarks import locate
 from s4a.input.raw import sentences
 from s4a.schema import dataset, in_unit
+from s4a.study.pair import pair_study
 
 X, T = as_arrays(s4a.synthetic.sphere(200))
 X = (X + 0.3 * np.exp(X * [1, -1, 1])) * [9, 6, 4]  # without symmetry
@@ -237,6 +238,14 @@ def test_a_study_of_files_in_two_systems_is_that_of_files_in_one(tmp_path):
     assert score[0] == pytest.approx(score[1], abs=1e-9)
     assert "1 of 3 shapes were converted to RAS: brain_03 (LPS)" in remarks[1]
     assert "converted" not in remarks[0]
+
+
+def test_a_study_of_a_pair_has_one_coordinate_system():
+    ras = as_dataset(X, T, system("RAS").attrs)
+    lps = as_dataset(X * [-1, -1, 1], T, system("LPS").attrs)
+    result = s4a.match_pair(ras, lps, n_coarse=100, k=10, k_init=6)
+    found = s4a.correspondence(pair_study(result, ras, lps), "source", "target")
+    assert found["image_position"].values == pytest.approx(X, abs=1e-6)
 
 
 def test_landmarks_lie_on_the_surface_whatever_the_two_files_say(tmp_path):
