@@ -2,7 +2,8 @@
 
 A pose of a shape is a rigid transform onto the reference.  Several are found by ICP from the
 principal axes.  Other aligned shapes vote: the pose that fits the reference and all of them best is
-used, so poses are consistent around the cycles of the network.
+used, so poses are consistent around the cycles of the network.  Of equally good poses, one that is
+close to the pose of the files is used.
 """
 
 import itertools
@@ -30,7 +31,7 @@ from s4a.input.plausibility import flag
 from s4a.method import spectral_icp
 from s4a.method.shape import Basis, corresponding_landmarks
 from s4a.options import check
-from s4a.schema import POSE
+from s4a.schema import POSE, Array
 
 N_VOTERS = 6
 # poses are equally good if the root mean square residual to the voters is at most ALIKE times that
@@ -38,6 +39,8 @@ N_VOTERS = 6
 # the difference of squares).  Shapes of a collection differ by about 0.04.  With fewer vertices
 # than ENOUGH their spacing hides part of the difference: ALIKE is lower, and NEARLY does not apply
 ALIKE, NEARLY, SAME, ENOUGH = 1.07, 1.2, 0.008, 400
+# degrees: of equally good poses, one so close to the pose of the files is used
+AS_GIVEN = 20.0
 _COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
 IDENTITY = np.eye(3), np.zeros(3)
 
@@ -47,8 +50,8 @@ class Alignment(NamedTuple):
 
     R: np.ndarray  # (3, 3)
     t: np.ndarray  # (3,)
-    fits: tuple[float, ...] = (0.0,)  # residuals of equally good poses, the best first
-    angle: float = 0.0  # degrees between the best and the second of them
+    fits: tuple[float, ...] = (0.0,)  # residuals of equally good poses, the least first
+    angle: float = 0.0  # degrees between the first and the second of them
 
     @property
     def transform(self) -> RigidTransform:
@@ -168,6 +171,8 @@ def _after(first: RigidTransform, second: RigidTransform) -> RigidTransform:
 def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Alignment:
     """Choose the pose with the least mean squared residual to the voters.
 
+    Of equally good poses, one within ``AS_GIVEN`` degrees of the pose of the files is chosen.
+
     Parameters
     ----------
     source : Basis
@@ -187,13 +192,21 @@ def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Ali
     residual = np.sqrt(squared.mean(0))
     known = min(1.0, len(source.X) / ENOUGH)
     same = (known == 1) & (abs(squared - squared[:, :1]).min(0) < SAME**2)
-    alike = residual <= np.where(same, NEARLY, 1 + known * (ALIKE - 1)) * residual[0]
-    fits = tuple(residual[alike].tolist())
+    equal = residual <= np.where(same, NEARLY, 1 + known * (ALIKE - 1)) * residual[0]
+    fits = tuple(residual[equal].tolist())
     if len(fits) < 2 or _differs(source, voters, (R, t)):
         return Alignment(R, t, fits[:1])
-    second = found[order[np.flatnonzero(alike)[1]]][0]
-    cosine = (np.trace(R.T @ second) - 1) / 2
-    return Alignment(R, t, fits, float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))))
+    alike = [found[i] for i in order[equal]]
+    angle = _degrees(R.T @ alike[1][0])
+    as_given = min(alike, key=lambda pose: _degrees(pose[0]))
+    if _degrees(as_given[0]) < AS_GIVEN:
+        R, t = as_given
+    return Alignment(R, t, fits, angle)
+
+
+def _degrees(R: Array) -> float:
+    """Return the angle of a rotation."""
+    return float(np.rad2deg(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))
 
 
 def _differs(source: Basis, voters: Voters, pose: RigidTransform) -> bool:
