@@ -2,8 +2,8 @@
 
 A pose of a shape is a rigid transform onto the reference.  Several are found by ICP from the
 principal axes.  Other aligned shapes vote: the pose that fits the reference and all of them best is
-used, so poses are consistent around the cycles of the network.  Of equally good poses, one that is
-close to the pose of the files is used.
+used, so poses are consistent around the cycles of the network.  If several are equally good, the
+pose of the files is used where ICP from it fits nearly as well and rotates the shape little.
 """
 
 import itertools
@@ -39,8 +39,7 @@ N_VOTERS = 6
 # the difference of squares).  Shapes of a collection differ by about 0.04.  With fewer vertices
 # than ENOUGH their spacing hides part of the difference: ALIKE is lower, and NEARLY does not apply
 ALIKE, NEARLY, SAME, ENOUGH = 1.07, 1.2, 0.008, 400
-# degrees: of equally good poses, one so close to the pose of the files is used
-AS_GIVEN = 20.0
+AS_GIVEN = 20.0  # degrees by which ICP from the pose of the files may rotate it
 _COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
 IDENTITY = np.eye(3), np.zeros(3)
 
@@ -171,7 +170,8 @@ def _after(first: RigidTransform, second: RigidTransform) -> RigidTransform:
 def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Alignment:
     """Choose the pose with the least mean squared residual to the voters.
 
-    Of equally good poses, one within ``AS_GIVEN`` degrees of the pose of the files is chosen.
+    If several are equally good, the result of ICP from the pose of the files is chosen, provided
+    that it fits nearly as well and is within ``AS_GIVEN`` degrees of that pose.
 
     Parameters
     ----------
@@ -181,27 +181,32 @@ def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Ali
     found : sequence of tuple (R, t)
         Poses of the source on the reference.
     """
-    rows = []
-    for other, onto in voters.values():
-        starts = [relative_transform(pose, onto) for pose in found]
-        ends = icp_each(source.cloud, other.cloud, starts, tolerance=5 * ROUGH)
-        rows.append([residual**2 for *_, residual in ends])
-    squared = np.array(rows)  # (voters, poses)
+    squared = _squared_residuals(source, voters, found)
     order = np.argsort(squared.mean(0), kind="stable")
     squared, (R, t) = squared[:, order], found[order[0]]
     residual = np.sqrt(squared.mean(0))
     known = min(1.0, len(source.X) / ENOUGH)
     same = (known == 1) & (abs(squared - squared[:, :1]).min(0) < SAME**2)
-    equal = residual <= np.where(same, NEARLY, 1 + known * (ALIKE - 1)) * residual[0]
-    fits = tuple(residual[equal].tolist())
+    alike = residual <= np.where(same, NEARLY, 1 + known * (ALIKE - 1)) * residual[0]
+    fits = tuple(residual[alike].tolist())
     if len(fits) < 2 or _differs(source, voters, (R, t)):
         return Alignment(R, t, fits[:1])
-    alike = [found[i] for i in order[equal]]
-    angle = _degrees(R.T @ alike[1][0])
-    as_given = min(alike, key=lambda pose: _degrees(pose[0]))
-    if _degrees(as_given[0]) < AS_GIVEN:
-        R, t = as_given
+    angle = _degrees(R.T @ found[order[np.flatnonzero(alike)[1]]][0])
+    S, u = realign(source.cloud, next(iter(voters.values()))[0].cloud, IDENTITY)
+    fit = np.sqrt(_squared_residuals(source, voters, [(S, u)]).mean())
+    if _degrees(S) < AS_GIVEN and fit < NEARLY * fits[0]:
+        R, t = S, u
     return Alignment(R, t, fits, angle)
+
+
+def _squared_residuals(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Array:
+    """Return the squared residuals (voters, poses) of ICP from each pose to each voter."""
+    rows = []
+    for other, onto in voters.values():
+        starts = [relative_transform(pose, onto) for pose in found]
+        ends = icp_each(source.cloud, other.cloud, starts, tolerance=5 * ROUGH)
+        rows.append([residual**2 for *_, residual in ends])
+    return np.array(rows)
 
 
 def _degrees(R: Array) -> float:
