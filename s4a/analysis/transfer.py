@@ -29,7 +29,7 @@ from s4a.geometry.closest import (
     interpolation_matrix,
 )
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas, vertex_normals
-from s4a.input.coordinates import CoordinateSystem
+from s4a.input.coordinates import CoordinateSystem, in_one_system
 from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, as_landmarks, locate, trace_curves
 from s4a.method.register import common_unit, identity, uncertainty
 from s4a.method.remesh import laplacian
@@ -306,7 +306,9 @@ def plan(
         )
     if isinstance(source, xr.Dataset):
         require(source, "position", "corner_vertex", what="source")
-        mesh, up = source, _routes_from_outside(study, source, options or {})
+        both = {"template": study["original"][template].to_dataset(), "source": source}
+        mesh = in_one_system(both)["source"]
+        up = _routes_from_outside(study, mesh, options or {})
     elif options:
         raise ValueError(
             f"options {', '.join(options)} need an external source, which is matched to the "

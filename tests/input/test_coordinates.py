@@ -238,14 +238,25 @@ def test_a_study_of_files_in_two_systems_is_that_of_files_in_one(tmp_path):
     assert score[0] == pytest.approx(score[1], abs=1e-9)
     assert "1 of 3 shapes were converted to RAS: brain_03 (LPS)" in remarks[1]
     assert "converted" not in remarks[0]
+    labels = []
+    for text, flip in (("RAS", [1, 1, 1]), ("LAS", [-1, 1, 1])):  # an external source
+        mesh = brains["brain_02"].to_dataset()
+        turned = mesh["corner_vertex"].values[:, :: 1 if text == "RAS" else -1]
+        source = as_dataset(mesh["position"].values * flip, turned, system(text, "").attrs)
+        found = s4a.transfer_labels(study, mesh["label"].values, source=source)
+        labels.append(found["brain_01/label"].values)
+    assert (labels[0] == labels[1]).all()
 
 
-def test_a_study_of_a_pair_has_one_coordinate_system():
+def test_a_pair_and_its_study_have_one_coordinate_system():
     ras = as_dataset(X, T, system("RAS").attrs)
     lps = as_dataset(X * [-1, -1, 1], T, system("LPS").attrs)
     result = s4a.match_pair(ras, lps, n_coarse=100, k=10, k_init=6)
     found = s4a.correspondence(pair_study(result, ras, lps), "source", "target")
     assert found["image_position"].values == pytest.approx(X, abs=1e-6)
+    las = as_dataset(X * [-1, 1, 1], T[:, ::-1], system("LAS").attrs)
+    table = s4a.compare(ras, las, methods=["kNN"], n_coarse=100, k=10, k_init=6)
+    assert table["chamfer"].item() == pytest.approx(0, abs=1e-9)
 
 
 def test_landmarks_lie_on_the_surface_whatever_the_two_files_say(tmp_path):
