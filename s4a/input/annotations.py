@@ -295,8 +295,8 @@ def _column(text, name, case, is_head):
     rows = table_rows(text)
     header = next(iter(rows.values()))
     head, n = [case(cell) for cell in header], len(header)
-    if n > 1 and name not in head:
-        raise ValueError(f"a column {name!r} needed, found {', '.join(header)[:80]}")
+    if n > 1 and head.count(name) != 1:
+        raise ValueError(f"one column {name!r} needed, found {', '.join(header)[:80]}")
     at = head.index(name) if n > 1 else 0
     if n > 1 or is_head(head[0]):
         del rows[next(iter(rows))]
@@ -460,6 +460,7 @@ def _meshlab_points(text):
     return CoordinateSystem(), rows
 
 
+_NAMES = ("name", "label", "landmark", "point", "id", "")  # the last of an index of pandas
 _TRUE = ("1", "true", "yes")
 # values of points that have a position; numbers: 0 undefined, 1 preview, 2 defined, 3 missing
 _SET = {"positionstatus": ("", "2", "defined"), "defined": ("", *_TRUE)}
@@ -479,10 +480,11 @@ def _table_points(text):
         header += ["positionstatus", "created"]  # of 3D Slicer 5, which does not name them
     head = [cell.lower() for cell in header]
     name, curve, closed, status = None, None, None, None
-    letters = next((axes for axes in ("xyz", "lps", "ras") if {*axes} <= {*head}), "")
+    systems_of_axes = (a for a in ("xyz", "lps", "ras") if all(head.count(x) == 1 for x in a))
+    letters = next(systems_of_axes, "")
     if letters:
         x = [head.index(axis) for axis in letters]
-        name = next((head.index(n) for n in ("name", "label", "landmark") if n in head), None)
+        name = next((head.index(n) for n in _NAMES if n in head), None)
         curve, closed = (head.index(n) if n in head else None for n in ("curve", "closed"))
         del rows[next(iter(rows))]
         status = next((head.index(n) for n in _SET if n in head), None)

@@ -386,6 +386,7 @@ def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
     np.save(tmp_path / "half.npy", np.array([0.5, 1]))
     np.savez(tmp_path / "two.npz", p=np.arange(4), q=np.arange(4))
     (tmp_path / "a.csv").write_text("p,q\n1,2\n")
+    (tmp_path / "twice.csv").write_text("label,label\n1,2\n")
     (tmp_path / "lh.label").write_text("#!ascii label  , from subject\n1\n99 1 2 3 0\n")
     for name, n, text in (
         ("lh.label", 5, "one label for every vertex expected, found some vertices"),
@@ -397,7 +398,8 @@ def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
             r"one array of 4 values needed, found p \(4,\), q \(4,\); name it as two.npz:NAME",
         ),
         ("two.npz:r", 4, "array .r. needed, found p, q"),
-        ("a.csv", 1, "a column 'label' needed, found p, q"),
+        ("a.csv", 1, "one column 'label' needed, found p, q"),
+        ("twice.csv", 1, "one column 'label' needed, found label, label"),
         ("none.npy", 1, "no file .*none.npy"),
     ):
         with pytest.raises(ValueError, match=text):

@@ -315,6 +315,7 @@ def test_landmark_files_of_other_programs_are_read(tmp_path, caplog):
             f'{{"position": {p}, "positionStatus": "{s}"}}' for s, p in (
                 ("preview", [0] * 3), ("defined", P[0].tolist()),
                 ("missing", [0] * 3), ("defined", P[1].tolist())))), "LPS", ["2", "4"]),
+        "index.csv": (",x,y,z\na,1.5,2,3\nb,-4,5.25,6\n", "", names),
         "unit.csv": ("name,x,y,z,unit,coordinate_system\na,1.5,2,3,mm,LPS\nb,-4,5.25,6,,\n",
                      "LPS", names),
         "old.fcsv": (f"{HEAD}# CoordinateSystem = 0\n{COLUMNS}{fcsv}", "RAS", names),
@@ -350,7 +351,9 @@ def test_landmark_files_of_other_programs_are_read(tmp_path, caplog):
     point = '{"position": [1, 2, 3], "coordinateSystem": "RAS"}'
     (tmp_path / "a.mrk.json").write_text(MARKUPS % ('"LPS"', point))
     (tmp_path / "b.json").write_text("{}")
+    (tmp_path / "twice.csv").write_text("name,x,y,z,x,y,z\na,1,2,3,4,5,6\n")
     wrong["b.json"] = "'markups' expected, found none"
+    wrong["twice.csv"] = "the columns name, x, y and z needed, found name, x, y, z, x, y, z"
     wrong["a.mrk.json"] = "one coordinate system expected, found LPS and RAS"
     for name, words in wrong.items():
         with pytest.raises(ValueError, match=words):
