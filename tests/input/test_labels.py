@@ -333,7 +333,7 @@ def test_one_command_leads_from_volumes_to_modes_and_resumes_and_inserts(volumes
     assert cli.main(["insert", *into, "--coordinate-system", "RAS", "--unit", "mm"]) == 0
     Y, S = mesh
     half = S[Y[S][:, :, 0].min(1) > Y[:, 0].mean() - 4]
-    s4a.write_mesh(tmp_path / "half.ply", Y, half)
+    s4a.write_mesh(tmp_path / "half.ply", Y, half, coordinate_system="RAS", unit="mm")
     part = [str(out), str(tmp_path / "half.ply"), "--samples", "0", "--out", str(tmp_path / "h")]
     assert cli.main(["complete", *part]) == 0
     np.save(tmp_path / "labels.npy", (Y[:, 0] > Y[:, 0].mean()).astype(int))
