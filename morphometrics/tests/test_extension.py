@@ -9,6 +9,8 @@ import tomllib
 import pytest
 from paths import DOCS
 
+from s4a.schema import Table
+
 CODE = """
 import s4a
 from s4a.cli import main
@@ -68,6 +70,14 @@ def test_the_extension_of_the_page_has_its_command_its_tab_and_its_variable(
     assert "Test whether the size of shapes" in done.stdout  # of --help
     head = (extension / "out" / "size.shape.csv").read_text().splitlines()[0]
     assert head == "shape,centroid_size"
+
+
+def test_a_row_of_another_extension_is_not_replaced_and_a_warning_names_it(caplog):
+    table = Table({"size": ("shape", "1", "a size")})
+    table.add({"size": ("shape", "mm", "another size"), "area": ("", "mm2", "an area")})
+    assert table["size"] == (("shape",), "1", "a size")
+    assert "size is in the table already" in caplog.text
+    assert "area" in table
 
 
 def test_an_extension_that_cannot_be_imported_is_named_and_left_out(extension):
