@@ -146,6 +146,19 @@ def _sorted_mesh(X, T):
     return X[order], T[surface.lexical_order(np.stack([T[:, 2], first_two], axis=1))], order
 
 
+def without_ties(X: Array, T: Array) -> Array:
+    """Move vertices by at most 1e-7 of sqrt(area) so that hardly any distances are equal.
+
+    Vertices of surfaces from volumes lie on a grid.  Rounding would decide between equally distant
+    ones, and the samples would depend on the pose of the file.  Every vertex moves along the line
+    through the centroid, by a share that follows from its distance in a chaotic way.
+    """
+    area = vertex_areas(X, T)
+    offset = X - area @ X / area.sum()
+    share = 1e4 * np.linalg.norm(offset, axis=1) / np.sqrt(area.sum()) % 1
+    return X + 1e-7 * share[:, None] * offset
+
+
 def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
     """Manifold dual of about `n_coarse` geodesic Voronoi cells.
 
@@ -159,7 +172,7 @@ def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
     attrs : dict
         Numbers of samples, iterations and vertices cut.
     """
-    V, F = X, T  # the surface after cutting handles
+    V, F = without_ties(X, T), T  # the surface after cutting handles
     origin = np.arange(len(X))  # row of X of each vertex of V, -1 for the centre of a fan
     for max_samples in [MAX_SHARE * n_coarse] * _N_CUTS + [np.inf]:
         graph = voronoi.mesh_graph(V, F)
@@ -191,7 +204,9 @@ def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
     }
     if attrs["vertices_cut"]:
         cell = cell[_nearest_along_edges(X, T, np.flatnonzero(cell >= 0))]
-    return V[state.sample], voronoi.dual(F, state.cell), origin[state.sample], cell, attrs
+    of_sample = origin[state.sample]
+    Y = np.where(of_sample[:, None] >= 0, X[of_sample], V[state.sample])
+    return Y, voronoi.dual(F, state.cell), of_sample, cell, attrs
 
 
 def _nearest_along_edges(X, T, vertices):
