@@ -131,12 +131,12 @@ def laplacian(X: Array, T: Array, area: Array) -> tuple[Array, Array, Array, str
     return E, np.bincount(edge_of, surface.half_cotangents(X, T), len(E)), area, "cotan"
 
 
-def _sorted_mesh(X, T):
-    """The mesh sorted by position, and the order of its vertices.
+def _sorted_mesh(X, T, key=None):
+    """The mesh sorted by position, or by a key of its vertices, and the order of its vertices.
 
     The coarse mesh then does not depend on the numbering of the file.
     """
-    order = surface.lexical_order(X[:, ::-1])
+    order = surface.lexical_order(X[:, ::-1]) if key is None else np.argsort(key)
     rank = np.empty(len(X), np.int64)
     rank[order] = np.arange(len(X))
     T = rank[T]
@@ -146,17 +146,22 @@ def _sorted_mesh(X, T):
     return X[order], T[surface.lexical_order(np.stack([T[:, 2], first_two], axis=1))], order
 
 
-def without_ties(X: Array, T: Array) -> Array:
-    """Move vertices by at most 1e-7 of sqrt(area) so that hardly any distances are equal.
-
-    Vertices of surfaces from volumes lie on a grid.  Rounding would decide between equally distant
-    ones, and the samples would depend on the pose of the file.  Every vertex moves along the line
-    through the centroid, by a share that follows from its distance in a chaotic way.
-    """
+def from_centroid(X: Array, T: Array) -> tuple[Array, Array]:
+    """Return the vectors ``(n, 3)`` from the centroid of a surface, and their lengths ``(n,)``."""
     area = vertex_areas(X, T)
     offset = X - area @ X / area.sum()
-    share = 1e4 * np.linalg.norm(offset, axis=1) / np.sqrt(area.sum()) % 1
-    return X + 1e-7 * share[:, None] * offset
+    return offset, np.linalg.norm(offset, axis=1)
+
+
+def without_ties(X: Array, T: Array) -> Array:
+    """Move vertices by about 1e-7 of the size, so that hardly any two distances are equal.
+
+    Vertices of surfaces from volumes lie on a grid.  Rounding would decide between equally distant
+    ones, and the samples would depend on the pose of the file.  A vertex moves away from the
+    centroid by a share that follows from its distance in a chaotic way.
+    """
+    offset, radius = from_centroid(X, T)
+    return X + 1e-7 * (1e4 * radius / radius.mean() % 1)[:, None] * offset
 
 
 def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
@@ -174,7 +179,8 @@ def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
     """
     V, F = without_ties(X, T), T  # the surface after cutting handles
     origin = np.arange(len(X))  # row of X of each vertex of V, -1 for the centre of a fan
-    for max_samples in [MAX_SHARE * n_coarse] * _N_CUTS + [np.inf]:
+    is_cut = False
+    for max_samples in [MAX_SHARE * n_coarse] * (1 + _N_CUTS) + [np.inf]:
         graph = voronoi.mesh_graph(V, F)
         is_centre = origin < 0
         n_initial = max(4, round(INITIAL_SHARE * n_coarse))
@@ -187,6 +193,10 @@ def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
         state, iterations, faulty = voronoi.refine(graph, cells, max_samples, is_centre)
         if not faulty:
             break
+        if not is_cut:  # cuts depend on the numbering: number from the outside, in any pose
+            is_cut = True
+            V, F, origin = _sorted_mesh(V, F, -from_centroid(V, F)[1])
+            continue
         region = voronoi.thin_regions(graph, cells)
         cell_area = triangle_areas(V, F).sum() / n_coarse
         V, F, rows = voronoi.cut_handles(

@@ -4,7 +4,9 @@ import igl
 import numpy as np
 import pytest
 from paths import DATA
+from scipy.ndimage import gaussian_filter
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from s4a.geometry.mesh import (
     as_arrays,
@@ -142,6 +144,19 @@ def test_the_coarse_mesh_is_a_manifold_of_the_same_topology_near_the_size_asked_
     assert coarse.attrs["euler_characteristic_original"] == euler
     assert_manifold(coarse, euler=euler)
     assert 0.9 * n_coarse <= coarse.sizes["vertex"] <= 1.2 * n_coarse
+
+
+def test_samples_of_a_surface_on_a_grid_with_thin_handles_do_not_depend_on_its_pose():
+    marching_cubes = pytest.importorskip("skimage.measure").marching_cubes
+    noise = np.random.default_rng(0).normal(size=(30, 30, 30))
+    radius = np.linalg.norm(np.indices(noise.shape) - 14.5, axis=0)
+    solid = (radius < 12) & ((gaussian_filter(noise, 1) < 0.25) | (radius < 7.5))
+    X, T = marching_cubes(np.pad(solid, 1).astype(float), 0.5)[:2]
+    X, T = as_arrays(clean(as_dataset(X.astype(float), T)))
+    R = Rotation.random(random_state=0).as_matrix()
+    one, other = (coarsen(as_dataset(P, T), n_coarse=100) for P in (X, X @ R.T + 5))
+    assert one.attrs["vertices_cut"] > 100
+    assert {*one["sample_vertex"].values} == {*other["sample_vertex"].values}
 
 
 @pytest.mark.parametrize("surface", [bumpy, torus, double_torus, plane])
