@@ -8,11 +8,7 @@ from scipy.spatial.transform import Rotation
 from s4a import analyse, cli, insert, synthetic, with_landmarks, write_mesh
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a_morphometrics import calibration, complete, posterior
-from s4a_morphometrics.calibration import (
-    between_paths,
-    deviation_of,
-    path_differences,
-)
+from s4a_morphometrics.calibration import between_paths, deviation_of, path_differences
 from s4a_morphometrics.completion import warnings_of
 from s4a_morphometrics.part import cut
 from s4a_morphometrics.partial import model_of

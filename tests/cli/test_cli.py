@@ -90,8 +90,7 @@ def test_view_writes_a_page_into_the_study_or_where_it_is_told(ran, tmp_path, mo
     study, _ = ran
     page = tmp_path / "page.html"
     monkeypatch.setattr(
-        "s4a.write_page",
-        lambda tree, file, **_: file.write_text(f"{len(tree['original'])} shapes"),
+        "s4a.write_page", lambda tree, file, **_: file.write_text(f"{len(tree['original'])} shapes")
     )
     assert cli.main(["view", str(study)]) == 0
     assert cli.main(["view", str(study), "--page", str(page)]) == 0

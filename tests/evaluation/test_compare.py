@@ -174,10 +174,7 @@ def test_what_is_wrong_is_said(three_brains):
         compare(source, target, methods=["ICP"])
     with pytest.raises(ValueError, match=r"the methods kNN.*found RE-MATCH refined, registered"):
         compare(source, target, methods=["kNN", *comparison.METHODS[-3:]], preset="paper")
-    with pytest.raises(
-        ValueError,
-        match="preset 'paper' sets full_resolution_iterations=0",
-    ):
+    with pytest.raises(ValueError, match="preset 'paper' sets full_resolution_iterations=0"):
         compare(source, target, preset="paper", full_resolution_iterations=1)
     with pytest.raises(ValueError, match="init must be one of 'landmarks', 'descriptors'"):
         compare(source, target, init="dense")

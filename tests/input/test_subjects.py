@@ -314,10 +314,7 @@ def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
     [
         ("shape,âge\na,1\n".encode("utf-16"), "found UTF-16: save it as CSV UTF-8"),
         ("shape,age\na,1\n".encode("utf-16-le"), "found UTF-16: save it as CSV UTF-8"),
-        (
-            "shape,age\nà,1\n".encode("latin-1"),
-            "byte 0xe0 in line 2: .* Latin-1 .* 'à'",
-        ),
+        ("shape,age\nà,1\n".encode("latin-1"), "byte 0xe0 in line 2: .* Latin-1 .* 'à'"),
         (b"shape,age\na,1\0\n", "the byte 0 in line 2: the file seems to be binary or damaged"),
         (b"PK\x03\x04\x14\0", "found a workbook or an archive: export it as CSV UTF-8"),
         (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "found a workbook or an archive"),

@@ -343,10 +343,7 @@ def test_one_usable_shape_is_not_enough_and_the_reasons_are_named(arrays):
 @pytest.mark.parametrize(
     "options, message",
     [
-        (
-            {"init": "random"},
-            r"init must be one of 'dense', 'landmarks', 'wave_kernels'; found",
-        ),
+        ({"init": "random"}, r"init must be one of 'dense', 'landmarks', 'wave_kernels'; found"),
         ({"refine": 1}, r"refine must be one of 'elastic', 'spectral_icp', 'intrinsic'"),
         ({"dense_match": "mine"}, r"dense_match must be one of 'latent', 'fmap'"),
         ({"norm": "l2"}, r"norm must be one of 'h2', 'h1', 'frobenius', 'h2_image'"),

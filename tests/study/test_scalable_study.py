@@ -192,8 +192,7 @@ def test_what_it_cannot_have_is_refused_by_name(brain_files, tmp_path, capsys):
     with pytest.raises(ValueError, match="method must be one of 'rematch', 'scalable'; found 'zo'"):
         Options(method="zo")
     with pytest.raises(
-        ValueError,
-        match="no coarse mesh, and refined_eigenfunctions=True refines its",
+        ValueError, match="no coarse mesh, and refined_eigenfunctions=True refines its"
     ):
         Options(method="scalable", refined_eigenfunctions=True)
     words = ["run", str(brain_files[0]), "--out", str(tmp_path / "no"), "--method", "scalable"]
