@@ -425,9 +425,10 @@ def test_files_that_do_not_hold_what_they_should_are_named_with_what(folder):
         store.write(change(data), path, key, made_from)
         with pytest.raises(OSError, match=message):
             open_study(folder).load()
-        reader = Reader(folder)  # if not this file, one that no longer fits it is damaged
-        states = (check_file(reader, one)[0] for one in names_in_order(folder))
-        assert "damaged" in states, message
+        if check_file(Reader(folder), name)[0] != "damaged":  # one that no longer fits it is
+            reader, names = Reader(folder), names_in_order(folder)
+            later = [one for one in names if one.startswith(("registration", "pca"))]
+            assert "damaged" in [check_file(reader, one)[0] for one in later], message
         rewritten(path, whole)
 
 
