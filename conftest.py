@@ -11,9 +11,8 @@ import os
 import sys
 import tempfile
 
-import numpy as np
 import pytest
-from small import OPTIONS
+from small import OPTIONS, without_pictures
 
 import s4a
 from s4a import analyse, coarsen, open_study, spectrum, synthetic
@@ -140,10 +139,15 @@ def short_films(monkeypatch):
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Pages have pictures of a few pixels; those that are looked at have tests of their own."""
-    from s4a.show import page, pictures
+    without_pictures(monkeypatch)
 
-    for module in (page, pictures):
-        monkeypatch.setattr(module, "render", lambda *a, **options: np.zeros((2, 2, 4), np.uint8))
+
+@pytest.fixture(scope="module")
+def no_pictures_in_module():
+    """The same for all tests of a module that comes first to pages."""
+    with pytest.MonkeyPatch.context() as patch:
+        without_pictures(patch)
+        yield
 
 
 def pytest_terminal_summary(terminalreporter):
