@@ -64,7 +64,7 @@ def size_of(X, T):
 
 
 @given(transform=MOTION, unit=UNIT, seed=SEED)
-@few(10)
+@few(5)
 def test_cleaning_a_dirty_surface(brains, transform, unit, seed):
     X, T = next(iter(brains.values()))
     X = np.vstack(
@@ -98,7 +98,7 @@ def test_cleaning_a_dirty_surface(brains, transform, unit, seed):
 
 
 @given(transform=MOTION, unit=UNIT, seed=SEED)
-@few(10)
+@few(2)
 def test_the_spectrum_at_low_resolution(brains, transform, unit, seed):
     X, T = next(iter(brains.values()))
     one = spectrum(coarsen(as_dataset(X, T), n_coarse=300), k=12)
@@ -121,7 +121,7 @@ def pair(brains):
 
 
 @given(transforms=st.tuples(TURNED, TURNED), unit=UNIT, seed=SEED)
-@few(4)
+@few(2)
 def test_the_displacement_of_a_pair(brains, pair, transforms, unit, seed):
     (X, T), (Y, S) = list(brains.values())[:2]
     size = size_of(Y, S)
@@ -145,7 +145,7 @@ def collection():
 
 
 @given(transforms=st.tuples(*4 * [TURNED]), unit=UNIT, seed=SEED, order=st.permutations(range(4)))
-@few(3)
+@few(1)
 def test_the_study_of_a_collection(collection, transforms, unit, seed, order):
     shapes, one = collection
     names, given, old_vertex = list(shapes), {}, {}
