@@ -1,4 +1,4 @@
-"""The options of the small study that tests share, as of Python and of the command line."""
+"""The small study that tests share, and small pictures, shapes and searches where any will do."""
 
 import numpy as np
 
@@ -14,3 +14,38 @@ def without_pictures(patch):
 
     for module in (page, pictures):
         patch.setattr(module, "render", lambda *a, **options: np.zeros((2, 2, 4), np.uint8))
+
+
+def small_pictures(patch):
+    """Let figures have pictures of a fifth of their width."""
+    from s4a.show import charts
+
+    render = charts.render
+    patch(charts, "render", lambda *a, size, **o: render(*a, size=(72, 60), **o))
+
+
+def small_searches(patch):
+    """Let partial shapes be matched by fewer points, from fewer initialisations."""
+    from s4a_morphometrics import part
+
+    for name, value in {"N_POINTS": 300, "N_ANCHORS": 3, "N_ROUGH": 80}.items():
+        patch(part, name, value)
+
+
+def small_brains(patch, most_shapes, most_vertices):
+    """Let simulated collections have at most so many shapes and vertices."""
+    from s4a import synthetic
+
+    brains = synthetic.brains
+    few = lambda m, n, **o: brains(min(m, most_shapes), min(n, most_vertices), **o)  # noqa: E731
+    patch(synthetic, "brains", few)
+
+
+def launch(argv):
+    """Run a kernel in which pictures, collections and searches are small."""
+    from ipykernel.kernelapp import launch_new_instance
+
+    small_pictures(setattr)
+    small_searches(setattr)
+    small_brains(setattr, 8, 2500)
+    launch_new_instance(argv)

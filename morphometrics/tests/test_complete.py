@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy.spatial.transform import Rotation
+from small import small_searches
 
 from s4a import analyse, cli, insert, synthetic, with_landmarks, write_mesh
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a_morphometrics import calibration, complete, posterior
-from s4a_morphometrics import part as partial_shape
 from s4a_morphometrics.calibration import between_paths, deviation_of, path_differences
 from s4a_morphometrics.completion import warnings_of
 from s4a_morphometrics.part import cut
@@ -22,9 +22,7 @@ TURN = Rotation.from_rotvec([0.3, -0.5, 0.4]).as_matrix()
 def few_points():
     """Search with fewer points and initialisations, as the shapes are small and smooth."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(partial_shape, "N_POINTS", 300)
-        patch.setattr(partial_shape, "N_ANCHORS", 3)
-        patch.setattr(partial_shape, "N_ROUGH", 80)
+        small_searches(patch.setattr)
         yield
 
 

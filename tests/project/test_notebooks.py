@@ -17,6 +17,7 @@ import time
 
 import pytest
 from paths import LESSONS, NOTEBOOKS, ROOT
+from small import launch
 
 import s4a
 from s4a import course
@@ -90,7 +91,8 @@ async def added(client, source):
 
 # what lessons import is loaded once; the kernel of each is a fork of that process
 LOADED = ["ipykernel.kernelapp", "matplotlib.pyplot", "ipywidgets", "sklearn.decomposition"]
-LOADED += ["s4a.course", "s4a.widgets", "s4a.study.pipeline", "s4a.statistics", "s4a_morphometrics"]
+LOADED += ["s4a.course", "s4a.widgets", "s4a.study.pipeline", "s4a.analysis.statistics"]
+LOADED += ["s4a_morphometrics.part", "small"]
 
 
 class Fork:
@@ -100,12 +102,10 @@ class Fork:
     stdin = stdout = stderr = None
 
     def __init__(self, command, cwd=None, **_):
-        from ipykernel.kernelapp import launch_new_instance
-
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(LOADED)
         argv = command[command.index("-f") :]
-        self.process = context.Process(target=launch_new_instance, kwargs={"argv": argv})
+        self.process = context.Process(target=launch, args=[argv])
         with contextlib.chdir(cwd or os.curdir):  # where the process begins
             self.process.start()
 

@@ -9,6 +9,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from paths import DOCS, ROOT
+from small import small_brains, small_pictures, small_searches
 
 import s4a
 from s4a.geometry.mesh import as_arrays
@@ -43,8 +44,9 @@ def small(tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     matplotlib.use("agg")
-    brains = s4a.synthetic.brains
-    monkeypatch.setattr(s4a.synthetic, "brains", lambda m, n, **o: brains(m, min(n, 800), **o))
+    small_brains(monkeypatch.setattr, 9, 800)
+    small_pictures(monkeypatch.setattr)
+    small_searches(monkeypatch.setattr)
     for name in ("analyse", "match_pair", "register_pairs"):
         monkeypatch.setattr(s4a, name, limited(getattr(s4a, name), "n_coarse", 250))
 

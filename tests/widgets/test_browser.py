@@ -20,7 +20,6 @@ from browsing import (
     TITLES,
     VIEW,
     barriers,
-    check_barriers,
     check_read,
     check_themes,
     chosen,
@@ -714,16 +713,6 @@ def test_axe_sees_what_it_should(browser):
     page.close()
 
 
-@pytest.mark.parametrize("title", TITLES)
-def test_a_panel_has_no_serious_barrier(sizes, title):
-    tabs = tabs_of(sizes, 3, title)
-    if title == "Network":
-        panel_of(tabs).locator(".s4a-edge").nth(6).dispatch_event("click")
-        panel_of(tabs).locator(".s4a-title", has_text="the target").wait_for()
-    assert panel_of(tabs).get_attribute("role") == "region", "a landmark"
-    check_barriers(sizes, panel_of(tabs))
-
-
 # ---- every theme
 
 
@@ -739,8 +728,15 @@ def test_contrast_is_measured_as_wcag_defines_it(browser):
 
 @pytest.mark.parametrize("theme", THEMES)
 def test_every_text_of_every_tab_is_read_in_every_theme(sizes, theme):
-    tabs = {title: lambda title=title: tabs_of(sizes, 3, title) for title in TITLES}
-    check_themes(sizes, theme, tabs, 20)
+    def shown(title):
+        tabs = tabs_of(sizes, 3, title)
+        if title == "Network":
+            panel_of(tabs).locator(".s4a-edge").nth(6).dispatch_event("click")
+            panel_of(tabs).locator(".s4a-title", has_text="the target").wait_for()
+        assert panel_of(tabs).get_attribute("role") == "region", "a landmark"
+        return tabs
+
+    check_themes(sizes, theme, {title: lambda title=title: shown(title) for title in TITLES}, 20)
 
 
 # ---- without a kernel
@@ -748,16 +744,16 @@ def test_every_text_of_every_tab_is_read_in_every_theme(sizes, theme):
 
 def test_the_page_deforms_without_kernel_and_network(show, study):
     page = show(widgets.Modes(study))
+    assert barriers(page) == []
     check_sliders(page, study)
 
 
-@pytest.mark.parametrize("components", [1, 2])
-def test_one_mode_has_no_chart_of_the_variance_of_many(show, study, components):
+def test_one_mode_has_no_chart_of_the_variance_of_many(show, study):
     some = study.copy()
-    some["pca"] = type(study)(study["pca"].to_dataset().isel(component=slice(components)))
+    some["pca"] = type(study)(study["pca"].to_dataset().isel(component=slice(1)))
     page = show(widgets.Modes(some))
     assert page.get_by_text("Scores: click").count() == 1
-    assert page.get_by_text("Explained variance").count() == components - 1
+    assert page.get_by_text("Explained variance").count() == 0
 
 
 def test_a_lasso_selects_the_visible_vertices_inside(show, study):
@@ -832,7 +828,7 @@ def study_page(study, tmp_path_factory):
     return s4a.write_page(study, tmp_path_factory.mktemp("page") / "study.html")
 
 
-@pytest.mark.parametrize("width, height", [(1366, 680), (1920, 1080), (3840, 2160)])
+@pytest.mark.parametrize("width, height", [(1366, 680), (1920, 1080)])
 def test_the_page_of_a_study_fills_a_wide_screen_one_idea_at_a_time(
     show, study_page, width, height
 ):
@@ -874,14 +870,9 @@ def test_the_page_of_a_study_has_no_serious_barrier_and_one_screen_an_idea(show,
     assert page.locator("h2:target").inner_text() == "Gallery"
 
 
-@pytest.mark.parametrize("kind", ["Modes", "Network", "Median", "Transfer", "Comparison"])
-def test_a_saved_panel_has_no_serious_barrier(show, study, compared, few_values, kind):
-    panel = getattr(widgets, kind)(compared if kind == "Comparison" else study)
-    assert barriers(show(panel, limit=200_000)) == []
-
-
 def test_the_page_of_the_network_shows_the_clicked_map(show, study):
-    page = show(widgets.Network(study))
+    page = show(widgets.Network(study), limit=200_000)
+    assert barriers(page) == []
     edge = visible(page, ".s4a-edge").nth(6)
     source, target = re.match(r"(\w+) → (\w+)", edge.get_attribute("aria-label")).groups()
     edge.dispatch_event("click")
@@ -905,23 +896,14 @@ def test_the_page_of_the_network_shows_the_clicked_map(show, study):
     assert visible(page, VIEW).count() == 1
 
 
-def test_the_page_of_the_network_says_which_maps_are_in_no_cycle(show, study):
-    tree = study.copy()
-    maps = tree["network"].to_dataset()
-    maps["cycle_error"] = maps["cycle_error"].where(np.arange(maps.sizes["pair"]) != 3)
-    tree["network"] = type(study)(maps)
-    page = show(widgets.Network(tree))
-    chosen(page, "stage", "after Consistent ZoomOut")
-    edges = page.locator(".s4a-edge")
-    told = [edge.get_attribute("aria-label") for edge in edges.all()]
-    assert [i for i, text in enumerate(told) if "cycle error unknown: in no cycle" in text] == [3]
-    assert edges.nth(3).locator(".s4a-line").get_attribute("stroke") == "#bbbbbb"
-
-
 @pytest.fixture(scope="module")
 def map_page(study, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "map.html"
-    panel = widgets.FunctionalMap(study)
+    few, maps = study.copy(), study["network"].to_dataset()
+    pairs = [{"brain_01", "brain_02"}, {"brain_02", "brain_03"}]
+    ends = zip(maps["source"].values, maps["target"].values, strict=True)
+    few["network"] = type(study)(maps.isel(pair=[{*pair} in pairs for pair in ends]))
+    panel = widgets.FunctionalMap(few)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(panel_page, "N_VALUES", 4)
         panel.save_html(path)
@@ -980,6 +962,7 @@ def test_the_axes_of_a_matrix_number_its_cells_and_nothing_overlaps(show, map_pa
 
 def test_the_page_of_the_median_ranks_by_the_selected_operator(show, study, few_values):
     page = show(widgets.Median(study))
+    assert barriers(page) == []
     chosen(page, "operator", "conformal")
     D = study["latent"]["conformal_difference"].values
     distance = np.sort(
@@ -1041,6 +1024,7 @@ def compared():
 def test_the_page_of_methods_marks_a_vertex_in_all_views(show, compared):
     panel = widgets.Comparison(compared, methods=["kNN", "RE-MATCH", "truth"])
     page = show(panel)
+    assert barriers(page) == []
     for width, columns in ((1920, 4), (800, 2)):
         page.set_viewport_size({"width": width, "height": 1000})
         boxes = [canvas.bounding_box() for canvas in visible(page, VIEW).all()]
@@ -1072,6 +1056,7 @@ def test_the_page_of_methods_marks_a_vertex_in_all_views(show, compared):
 
 def test_the_page_of_a_transfer_says_what_needs_python(show, study):
     page = show(widgets.Transfer(study))
+    assert barriers(page) == []
     assert "placing landmarks" in page.locator(".note:not(#not-recorded)").inner_text()
     chosen(page, "target", "brain_05")
     visible(page, ".s4a-title").filter(has_text="brain_05, the target").wait_for()
