@@ -10,6 +10,7 @@ import contextlib
 import os
 import sys
 import tempfile
+from functools import partial
 
 import pytest
 from small import OPTIONS, without_pictures
@@ -25,11 +26,6 @@ os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
 sys.modules["rfc3987_syntax"] = None
 # what a test reads, the system has, before it is on the disk
 os.fsync = lambda handle: None
-
-
-@pytest.fixture(scope="session")
-def example_study():
-    return synthetic.example_study()
 
 
 @pytest.fixture(autouse=True)
@@ -60,9 +56,12 @@ def meshes(brains):
 @pytest.fixture(scope="session")
 def brain_files(brains, tmp_path_factory):
     """The brains as PLY files."""
-    paths = synthetic.write(brains, tmp_path_factory.mktemp("brains"))
-    paths[0].with_name("truth.nc").unlink()
-    return paths
+
+    def make(folder):
+        synthetic.write(brains, folder)
+        (folder / "truth.nc").unlink()
+
+    return sorted(made_once(tmp_path_factory, "brains", make).glob("*.ply"))
 
 
 def made_once(tmp_path_factory, name, make):
@@ -91,6 +90,19 @@ def study_folder(brains, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def example_study(tmp_path_factory):
+    """The study of examples, which is in memory."""
+
+    def make(folder):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(synthetic, "analyse", partial(analyse, store=folder))
+            synthetic.example_study().close()
+
+    with open_study(made_once(tmp_path_factory, "study_of_examples", make)) as tree:
+        return tree.load()
+
+
+@pytest.fixture(scope="session")
 def structures_folder(tmp_path_factory):
     """The folder of the example study of several structures."""
     from s4a_morphometrics import analyse_structures
@@ -112,9 +124,14 @@ def study(study_folder):
 
 
 @pytest.fixture(scope="session")
-def study_of_files(brain_files):
+def study_of_files(brain_files, tmp_path_factory):
     """The study of the files, whose positions are rounded to single precision."""
-    return analyse(brain_files, **OPTIONS)
+
+    def make(folder):
+        analyse(brain_files, store=folder, **OPTIONS).close()
+
+    with open_study(made_once(tmp_path_factory, "study_of_files", make)) as tree:
+        return tree.load()
 
 
 @pytest.fixture(scope="session")
@@ -174,7 +191,7 @@ def pytest_terminal_summary(terminalreporter):
 SLOW = """
 notebooks browser site interruptions several pages complete properties widgets faults panels_browser
 pipeline scenes_browser quality_control study_files insert reflect leave_one_out cluster clean
-scalable_study landmarks labels asymmetry view subjects plausibility save_browser kills release
+scalable_study landmarks labels asymmetry view subjects plausibility save_browser release
 """.split()
 
 

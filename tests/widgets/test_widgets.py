@@ -869,10 +869,10 @@ def test_a_tab_shows_any_error_of_its_panel(study, monkeypatch, caplog):
 
 
 @pytest.fixture(scope="module")
-def inserted():
+def inserted(example_study):
     """A study of six brains, and one with a new brain inserted."""
     mesh = s4a.synthetic.brains(7, 200)["original/brain_07"].to_dataset()
-    return s4a.insert(s4a.synthetic.example_study(), {"brain_07": mesh})
+    return s4a.insert(example_study, {"brain_07": mesh})
 
 
 def test_of_an_inserted_shape_every_tab_is_shown_that_has_its_stage(inserted, caplog):
