@@ -189,9 +189,9 @@ def pytest_terminal_summary(terminalreporter):
 
 # files that take long begin first, the longest before all, so that no worker waits for the other
 SLOW = """
-notebooks browser site interruptions several pages complete properties widgets faults panels_browser
-pipeline scenes_browser quality_control study_files insert reflect leave_one_out cluster clean
-scalable_study landmarks labels asymmetry view subjects plausibility save_browser release
+notebooks browser site pages interruptions faults panels_browser widgets several complete pipeline
+scenes_browser quality_control reflect scalable_study leave_one_out insert study_files labels cli
+landmarks cluster asymmetry subjects plausibility initial_map steps compare two_block save_browser
 """.split()
 
 

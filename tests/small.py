@@ -1,5 +1,7 @@
 """The small study that tests share, and small pictures, shapes and searches where any will do."""
 
+from importlib.util import find_spec
+
 import numpy as np
 
 OPTIONS = {"n_coarse": 400, "k_init": 10, "k": 24, "n_jobs": 1}
@@ -14,6 +16,10 @@ def without_pictures(patch):
 
     for module in (page, pictures):
         patch.setattr(module, "render", lambda *a, **options: np.zeros((2, 2, 4), np.uint8))
+    if find_spec("anywidget"):
+        from s4a.widgets import views
+
+        patch.setattr(views, "SIZE", (120, 96))  # of the stills of panels
 
 
 def small_pictures(patch):

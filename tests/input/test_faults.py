@@ -74,7 +74,7 @@ def in_python(checked_folder):
 def ran(folder, tmp_path_factory):
     """What a run over all wrote, and its study."""
     out = tmp_path_factory.mktemp("out") / "study"
-    more = ["--n-pairs", "150", "--template", "good_0", "--n-jobs", "1"]
+    more = "--n-pairs 150 --alignment given --template good_0 --n-jobs 1".split()
     code, text = printed("run", str(folder), "--out", str(out), *FLAGS, *more)
     full = re.sub(r"\s+", " ", (out / "report.txt").read_text(encoding="utf-8"))
     with open_study(out) as study:
