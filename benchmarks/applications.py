@@ -1,12 +1,13 @@
 """What correspondences are good for.
 
-``applications.py [ellipsoids groups variance brains skulls faces heads template points parcels
-volumes]``.
+``applications.py [ellipsoids groups variance brains skulls faces heads template points
+sources parcels volumes]``.
 
 A one-mode family against the closed form, simulated groups, the variance explained at both
 resolutions (Fig. 5), transfer between two brain templates and between skulls, displacements and
 modes of faces against the published ones, a tenth head inserted into a study of nine, labels and
-landmarks of a template that is none of the collection (Fig. 6 and 7), 35 regions on remeshed
+landmarks of a template that is none of the collection (Fig. 6 and 7), landmarks of several skulls
+averaged, 35 regions on remeshed
 faces, bodies and cats by how far votes count, and 80 label volumes of hippocampi, from the files
 to modes by one command, whole and as two structures.  What is not synthetic needs the shared data
 beside the checkout.
@@ -324,6 +325,24 @@ def points(folder):
         )
 
 
+def sources(folder):
+    """Landmarks of each of five skulls from one other, and from all four others together."""
+    files = sorted((folder / "skulls").glob("*.ply"))
+    marks = {f.stem: read_landmarks(f.with_suffix(".mrk.json")) for f in files}
+    study = s4a.analyse({f.stem: s4a.read_shape(f) for f in files}, n_jobs=1)
+    error = {"one source": [], "four sources": []}
+    for name, mark in marks.items():
+        others = {other: one for other, one in marks.items() if other != name}
+        each = [{other: one} for other, one in others.items()]
+        for way, given in [*(("one source", one) for one in each), ("four sources", others)]:
+            found = s4a.transfer_landmarks(study, given, targets=[name])[name]
+            by_name = found.to_dataset().set_index(landmark="landmark_name")["landmark_position"]
+            found = by_name.sel(landmark=mark["landmark_name"].values).values
+            error[way].append(np.linalg.norm(found - mark["landmark_position"].values, axis=1))
+    for way, values in error.items():
+        say(f"{way}: mean {np.mean(values):.3f} mm, median {np.median(values):.3f}")
+
+
 def parcels(folder):
     """35 regions on remeshed faces, bodies and cats, by how far votes count.
 
@@ -497,11 +516,12 @@ def volumes():
             say(f"{name}: {n} of {len(list(files.glob('*.nii.gz')))} volumes, {took:.0f} s, {said}")
 
 
-REAL = ("brains", "skulls", "faces", "heads", "template", "points", "parcels", "volumes")
+REAL = ("brains", "skulls", "faces", "heads", "template", "points", "sources", "parcels", "volumes")
 # collections of these parts
 OF = {
     "template": ["brains"],
     "points": ["skulls"],
+    "sources": ["skulls"],
     "variance": ["faces"],
     "parcels": ["faces", "faust", "cats"],
 }

@@ -455,9 +455,41 @@ def plan(
     return mesh, routes_to_targets()
 
 
+def plan_several(
+    study: xr.DataTree,
+    given: Any,
+    source: str | xr.Dataset | None,
+    targets: list[str] | None,
+    options: dict[str, Any],
+) -> tuple[list[tuple[xr.Dataset, Any]], Iterator[tuple[str, xr.Dataset, list[list[Route]]]]]:
+    """Return (mesh, values) of every source, and an iterator of (target, mesh, routes by source).
+
+    `given` are the values of one `source`, or a dict of names of sources to their values.
+    """
+    several = isinstance(given, dict)
+    if several and (source is not None or not given):
+        raise ValueError(
+            f"a dict of sources to their values replaces source=; found {len(given)} sources and "
+            f"source={source if isinstance(source, str) or source is None else 'a mesh'!r}"
+        )
+    sources = list(given.items()) if several else [(source, given)]
+    if several and targets is None:
+        names = all_registered(study)["shape"].values.tolist()
+        targets = [name for name in names if name not in given]
+    plans = [plan(study, name, targets, options) for name, _ in sources]
+
+    def routes_to_targets():
+        for steps in zip(*(steps for _, steps in plans), strict=True):
+            name, target, _ = steps[0]
+            yield name, target, [routes for *_, routes in steps]
+
+    meshes = [mesh for mesh, _ in plans]
+    return list(zip(meshes, (values for _, values in sources), strict=True)), routes_to_targets()
+
+
 def transfer_labels(
     study: xr.DataTree,
-    label: np.ndarray,
+    label: Any,
     *,
     source: str | xr.Dataset | None = None,
     targets: list[str] | None = None,
@@ -465,20 +497,21 @@ def transfer_labels(
     blur: float | None = None,
     **options: Any,
 ) -> xr.DataTree:
-    """Transfer labels of one mesh to every shape of a registered study (6.2, Fig. 6).
+    """Transfer labels of one or several meshes to every shape of a study (6.2, Fig. 6).
 
     Parameters
     ----------
     study : DataTree
         A finished study, or a result of :func:`register_pairs` or :func:`pair_study`.
-    label : array_like (vertex,)
+    label : array_like (vertex,), or dict of str to array_like
         Numbers or names at the vertices of the source in ``/original`` (see
-        :func:`s4a.input.annotations.labels_of_mesh`).
+        :func:`s4a.input.annotations.labels_of_mesh`); or a dict of several sources to their labels,
+        which have equal votes.
     source : str or Dataset, optional
         Name of a shape of the study, by default the template; or an external mesh.  An external
         mesh is first matched to the template with the options of the study.
     targets : list of str, optional
-        Names of the shapes that receive the labels; by default all other shapes.
+        Names of the shapes that receive the labels; by default all that are not a source.
     votes : bool
         Also return the share of the votes for every label.
     blur : float, optional
@@ -544,15 +577,18 @@ def transfer_labels(
     """
     if blur is not None and not 0 <= blur <= 10:
         raise ValueError(f"blur needs a factor from 0 to 10; found {blur}")
-    mesh, routes_to_targets = plan(study, source, targets, options)
+    sources, routes_to_targets = plan_several(study, label, source, targets, options)
     blur = BLURS[_preset(study, options)] if blur is None else blur
-    label = _per_vertex(label, mesh, "label")
+    labels = [_per_vertex(values, mesh, "label") for mesh, values in sources]
     transferred = {}
     for name, target, routes in routes_to_targets:
-        W, confidence = blend_routes(routes, len(label))
-        vote, value = votes_of(W, label)
+        blended = [blend_routes(r, len(one)) for r, one in zip(routes, labels, strict=True)]
+        W = sp.hstack([W for W, _ in blended]).tocsr() / len(blended)
+        confidence = np.mean([confidence for _, confidence in blended], axis=0)
+        vote, value = votes_of(W, np.concatenate(labels))
         winner = majority(vote, value)
-        if blur and any(routes):  # the source itself has an empty route, without uncertainty
+        # the source itself has an empty route, without uncertainty
+        if blur and any(map(any, routes)):
             vote = diffuse_votes(vote, *as_arrays(target), blur * uncertainty(confidence))
             diffused = majority(vote, value)
             lost = np.setdiff1d(winner, diffused)
@@ -649,14 +685,14 @@ def _per_vertex(values, mesh, what):
 
 def transfer_landmarks(
     study: xr.DataTree,
-    landmarks: xr.Dataset | Path | str,
+    landmarks: xr.Dataset | Path | str | dict[str, xr.Dataset | Path | str],
     *,
     source: str | xr.Dataset | None = None,
     targets: list[str] | None = None,
     farthest: float = FARTHEST_LANDMARK,
     **options: Any,
 ) -> xr.DataTree:
-    """Transfer landmarks of one mesh to every shape of a registered study (6.2, Fig. 7).
+    """Transfer landmarks of one or several meshes to every shape of a study (6.2, Fig. 7).
 
     Curves of landmarks (``landmark_curve``, see :func:`s4a.input.annotations.read_landmarks`) are
     sampled along the surface of the source at the mean edge length, and become polylines.
@@ -666,8 +702,9 @@ def transfer_landmarks(
     study, source, targets, **options
         As in :func:`transfer_labels`: the study, the shape that the landmarks belong to, the shapes
         that receive them, and options for an external source.
-    landmarks : path or Dataset
-        A landmark file, or a result of :func:`s4a.input.annotations.read_landmarks`.
+    landmarks : path or Dataset, or dict of str to path or Dataset
+        A landmark file, or a result of :func:`s4a.input.annotations.read_landmarks`; or a dict of
+        several sources to theirs, with the same names.  Their images are averaged.
     farthest : float
         Largest valid distance of a landmark from the surface of the source, as a share of
         sqrt(area).
@@ -685,8 +722,8 @@ def transfer_landmarks(
         - ``landmark_confidence(landmark)``: confidence of the match, from 0 to 1.  It finds failed
           regions of shapes in different poses; among shapes in similar poses it is an average of
           the group and does not rank the points by their error;
-        - ``landmark_disagreement(landmark)``, if several matches are averaged: largest distance of
-          one of their results from the mean;
+        - ``landmark_disagreement(landmark)``, if several sources or matches are averaged: largest
+          distance of one of their results from the mean;
         - ``landmark_curve`` and ``landmark_closed``, with curves: name of the curve of each point,
           and True if the curve is closed.
 
@@ -726,17 +763,34 @@ def transfer_landmarks(
     >>> s4a.show.charts.surfaces(shown, colors)
     <TiledFigure ...>
     """
-    mesh, routes_to_targets = plan(study, source, targets, options)
-    landmarks = as_landmarks(landmarks)
-    marked = locate(landmarks, mesh, farthest=farthest)
-    if "landmark_curve" in landmarks:
-        marked = trace_curves(marked, mesh)
-    named = marked[[name for name in NAMED if name in marked]]
+    sources, routes_to_targets = plan_several(study, landmarks, source, targets, options)
+    marked = [_located(marks, mesh, farthest) for mesh, marks in sources]
+    marked = [marked[0], *(_in_order_of(marked[0], one) for one in marked[1:])]
+    named = marked[0][[name for name in NAMED if name in marked[0]]]
     transferred = {}
     for name, target, routes in routes_to_targets:
         image = _transfer_landmarks(marked, target, routes).merge(named)
         transferred[name] = image.assign_attrs(CoordinateSystem.of(target.attrs).attrs)
     return xr.DataTree.from_dict(transferred)
+
+
+def _located(landmarks, mesh, farthest):
+    """Landmarks and points along curves on the surface of a mesh."""
+    landmarks = as_landmarks(landmarks)
+    marked = locate(landmarks, mesh, farthest=farthest)
+    return trace_curves(marked, mesh) if "landmark_curve" in landmarks else marked
+
+
+def _in_order_of(first, marked):
+    """Landmarks in the order of the names of the first source; they must be the same."""
+    names, others = (one["landmark_name"].values.astype(str).tolist() for one in (first, marked))
+    if sorted(names) != sorted(others) or len(set(names)) < len(names):
+        wrong = sorted(set(names) ^ set(others)) or "names that occur twice"
+        raise ValueError(
+            f"several sources need the same landmarks with different names, and no curves; "
+            f"found in some only: {wrong}"
+        )
+    return marked.isel(landmark=[others.index(name) for name in names])
 
 
 def correspondence(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
@@ -785,7 +839,8 @@ def correspondence(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
     _, shape, routes = next(routes_to_targets)
     vertices = identity(Shape(mesh))
     points = vertices["template_triangle"].values, vertices["template_barycentric"].values
-    position, (triangle, weights), confidence, _ = _blend_points(points, shape, routes)
+    paths = [(points, route) for route in routes]
+    position, (triangle, weights), confidence, _ = _blend_points(paths, shape)
     image = dataset(
         image_triangle=triangle.astype(np.int32),
         image_barycentric=weights,
@@ -796,9 +851,13 @@ def correspondence(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
 
 
 def _transfer_landmarks(marked, target, routes):
-    """Mean of the landmarks of all routes, weighted by confidence, on the surface."""
-    points = marked["landmark_triangle"].values, marked["landmark_barycentric"].values
-    position, (triangle, weights), confidence, distance = _blend_points(points, target, routes)
+    """Mean of the landmarks of all sources and routes, weighted by confidence, on the surface."""
+    paths = [
+        ((one["landmark_triangle"].values, one["landmark_barycentric"].values), route)
+        for one, of_source in zip(marked, routes, strict=True)
+        for route in of_source
+    ]
+    position, (triangle, weights), confidence, distance = _blend_points(paths, target)
     disagreement = {} if distance is None else {"landmark_disagreement": distance}
     return dataset(
         landmark_position=position,
@@ -809,14 +868,14 @@ def _transfer_landmarks(marked, target, routes):
     )
 
 
-def _blend_points(points, target, routes):
-    """Mean of points along all routes, weighted by confidence, on the surface of the target.
+def _blend_points(paths, target):
+    """Mean of points, each along its route, weighted by confidence, on the surface of the target.
 
     Position ``(p, 3)``, triangle and weights, confidences ``(routes, p)``, and the largest distance
     of a route from the mean ``(p,)``, None for one route.
     """
     X, T = as_arrays(target)
-    results = [transfer_along(route, *points) for route in routes]
+    results = [transfer_along(route, *points) for points, route in paths]
     confidence = np.stack([result[2] for result in results])  # (routes, p)
     on_surface = results[0][:2]
     distance = None

@@ -158,6 +158,31 @@ def test_a_shape_gives_its_labels_through_the_template_to_the_others(study, mesh
         assert node["label_value"].values.tolist() == np.unique(label).tolist()
 
 
+def test_several_sources_are_averaged_and_have_equal_votes(study, meshes):
+    names = "brain_02", "brain_03"
+    labels = {n: meshes[n]["label"].values for n in names}
+    marks = {n: meshes[n][["landmark_name", "landmark_position"]] for n in names}
+    one, two = ({"label": [], "mark": []} for _ in range(2))
+    for given, found in (({names[0]}, one), (set(names), two)):
+        few = {n: labels[n] for n in names if n in given}
+        label = transfer_labels(study, few, targets=["brain_01"])["brain_01"]
+        found["label"] = (label["label"].values == meshes["brain_01"]["label"].values).mean()
+        few = {n: marks[n].isel(landmark=slice(None, None, -1)) for n in names[:1]}
+        few |= {n: marks[n] for n in names[1:] if n in given}
+        found["mark"] = transfer_landmarks(study, few, targets=["brain_01"])["brain_01"]
+    true = meshes["brain_01"]["landmark_position"].values[::-1]
+    errors = [distance(f["mark"]["landmark_position"].values, true).mean() for f in (one, two)]
+    assert errors[1] < errors[0]
+    assert two["label"] > one["label"]
+    assert (two["mark"]["landmark_disagreement"] > 0).all()
+    rest = transfer_labels(study, {n: labels[n] for n in names})
+    assert list(rest.children) == ["brain_01"]
+    with pytest.raises(ValueError, match="replaces source="):
+        transfer_labels(study, labels, source="brain_01")
+    with pytest.raises(ValueError, match="the same landmarks"):
+        transfer_landmarks(study, marks | {names[1]: marks[names[1]].isel(landmark=slice(3))})
+
+
 def test_named_labels_travel_too(study, meshes):
     names = np.array(synthetic.LABELS)[meshes["brain_01"]["label"].values]
     found = transfer_labels(study, names, targets=["brain_02"])["brain_02"]["label"].values
