@@ -188,7 +188,7 @@ def reference():
 
 
 def test_the_study_does_not_depend_on_position_and_unit(reference):
-    for factor, offset in ((1, 1e6), (1e-9, 0), (1e9, 0)):
+    for factor, offset in ((1, 1e6), (1e-9, 0)):
         result = analyse(collection(factor, offset), **OPTIONS)
         one, other = (t["registration"].to_dataset() for t in (reference, result))
         assert one.attrs["template"] == other.attrs["template"]

@@ -37,6 +37,12 @@ unit = 2**20 if sys.platform == "darwin" else 2**10
 seconds = sum(r.ru_utime + r.ru_stime for r in (own, child))
 json.dumps({"seconds": seconds, "MiB": (own.ru_maxrss + child.ru_maxrss) / unit})
 """
+FEWER = {  # what lessons compute of many, here of a few
+    'for subject in "ABCDEF"': 'for subject in "ABCDE"',
+    "subjects(12, 500": "subjects(8, 500",
+    "np.arange(11) < 6": "np.arange(7) < 4",
+    "n_permutations=999": "n_permutations=99",
+}
 each_notebook = pytest.mark.parametrize("path", LESSONS, ids=lambda path: path.stem)
 
 
@@ -132,6 +138,8 @@ async def played(path, folder):
     async with client.async_setup_kernel():
         listen_in_slices(client.kc.shell_channel)
         for i, cell in enumerate(list(notebook.cells)):
+            for many, few in FEWER.items() if cell.cell_type == "code" else ():
+                cell.source = cell.source.replace(many, few)
             await client.async_execute_cell(
                 cell, i
             )  # CellExecutionError where it fails and may not

@@ -1,14 +1,9 @@
 """The whole analysis (4, 6.1).
 
-End to end, the same on any number of workers, resumed after a kill, failures named.
+End to end, the same on any number of workers, failures named.
 """
 
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -196,38 +191,6 @@ def test_an_option_changes_what_depends_on_it_and_nothing_else(brains, study_fol
         p.relative_to(work).parts[0] for p, state in files(work).items() if before.get(p) != state
     }
     assert changed == {"registration"}
-
-
-KILLED = f"""
-import sys
-from s4a import analyse
-analyse(sys.argv[2:], store=sys.argv[1], **{OPTIONS})
-"""
-
-
-def test_a_killed_run_resumes(brain_files, study_of_files, tmp_path):
-    work = tmp_path / "study"
-    with subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(work), *map(str, brain_files)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    ) as run:
-        deadline = time.monotonic() + 60
-        while (
-            not any((work / "network").glob("alignment_*.nc"))
-            and run.poll() is None
-            and time.monotonic() < deadline
-        ):
-            time.sleep(0.005)
-        os.kill(run.pid, signal.SIGKILL)
-    assert not (work / "report.nc").exists()
-    before = {p: s for p, s in files(work).items() if p.suffix == ".nc"}
-    assert len(before) >= 9
-    with analyse(brain_files, store=work, **OPTIONS) as again:
-        assert_same(again, study_of_files)
-    after = files(work)
-    assert {p: after[p] for p in before} == before
-    assert not [p for p in after if p.suffix == ".tmp"]
 
 
 def test_the_paper_preset_runs_the_paper_way(brains):
