@@ -210,30 +210,6 @@ def test_a_clicked_edge_shows_its_map(page, study):
         visible(page, ".s4a-title").filter(has_text=re.compile(f"^{name},")).wait_for()
 
 
-def test_a_clicked_bar_shows_its_shape(page):
-    open_tab(page, "Median")
-    bar = visible(page, "rect.s4a-mark").nth(3)
-    name = bar.get_attribute("aria-label").split(":")[0]
-    bar.click()
-    visible(page, ".s4a-title").filter(has_text=f"{name}, in ").wait_for()
-    visible(page, ".s4a-readout").filter(has_text="rank 4 of 5").wait_for()
-
-
-def test_a_clicked_point_is_mapped_to_the_shape(page, study):
-    open_tab(page, "Correspondence")
-    canvas = visible(page, VIEW).first
-    box = canvas.bounding_box()
-    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    readout = visible(page, ".s4a-readout").filter(has_text="template vertex").first
-    readout.wait_for()
-    vertex, shape, image = re.search(
-        r"vertex (\d+) ↔ (\w+) vertex (\d+)", readout.inner_text()
-    ).groups()
-    assert study["registration"]["registered_match"].sel(shape=shape).values[int(vertex)] == int(
-        image
-    )
-
-
 def test_a_landmark_is_placed_and_transferred(page, study):
     open_tab(page, "Transfer")
     canvas = visible(page, VIEW).first
@@ -323,12 +299,6 @@ def test_whatever_can_be_clicked_has_a_name_and_is_reached_by_the_keyboard(page)
     assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid", (
         "focus is seen"
     )
-
-
-@pytest.mark.parametrize("title", ["Functional map", "Spectrum"])
-def test_the_other_tabs_draw(page, title):
-    open_tab(page, title)
-    assert visible(page, VIEW).count() == 2
 
 
 def test_nothing_is_cut_off_at_800_pixels(page):
