@@ -224,19 +224,11 @@ def test_every_option_of_analyse_is_a_flag_of_run_with_the_same_default():
 
 
 def test_flags_give_the_options_their_values():
-    flags = (
-        "--n-coarse 500 -k 50 --n-latent 40 --init landmarks --remove-size --no-strict --label 1,2"
-    )
-    found, _ = parsed(*flags.split(), *"--components 2 --template None --seed 7".split())
-    given = {
-        "n_coarse": 500,
-        "k": 50,
-        "n_latent": 40,
-        "init": "landmarks",
-        "remove_size": True,
-        "label": "1,2",
-    }
-    given |= {"components": 2, "template": "None", "seed": 7}
+    flags = "--n-coarse 500 -k 50 --n-latent 40 --init landmarks --remove-size --no-strict"
+    flags += " --label 1,2 --components 2 --template None --seed 7"
+    found, _ = parsed(*flags.split())
+    given = {"n_coarse": 500, "k": 50, "n_latent": 40, "init": "landmarks", "remove_size": True}
+    given |= {"label": "1,2", "components": 2, "template": "None", "seed": 7}
     assert Options(**found) == Options(**given)
 
 

@@ -268,13 +268,8 @@ def test_the_command_writes_table_file_and_figure(tmp_path, capsys):
     for name, points in (("source", marks), ("target", marks[::-1])):
         rows = "\n".join(f"{i},{x},{y},{z}" for i, (x, y, z) in enumerate(points))
         (tmp_path / f"{name}.csv").write_text("name,x,y,z\n" + rows)
-    given = [
-        "--methods",
-        "RE-MATCH",
-        "--landmarks",
-        str(tmp_path / "source.csv"),
-        str(tmp_path / "target.csv"),
-    ]
+    files = [str(tmp_path / f"{name}.csv") for name in ("source", "target")]
+    given = ["--methods", "RE-MATCH", "--landmarks", *files]
     assert main(["compare", one, two, *given, *options]) == 0
     assert "RE-MATCH" in capsys.readouterr().out
     assert main(["compare", one, two, *given[:-1], *options]) == 2
