@@ -22,7 +22,7 @@ import s4a
 from s4a.cli import tables
 from s4a.cli.doctor import examine, lines
 from s4a.cli.flags import ALL_OPTIONS, command
-from s4a.options import DECLARED, N_COARSE, Options
+from s4a.options import DECLARED, N_COARSE, Options, names_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -693,10 +693,9 @@ def write(*texts: str) -> None:
 
 OF_PAIRS = [name for name, one in DECLARED.items() if one.metadata["pair"]]
 SYSTEM = ("coordinate_system", "unit")
-CLEANING = ("components", "pattern", "label", "strict", "close_holes", "intersections", *SYSTEM)
 COMMANDS = {
     "doctor": command(doctor),
-    "check": command(check, CLEANING),
+    "check": command(check, ("pattern", *names_of("cleaning"), "intersections")),
     "run": command(run, ALL_OPTIONS),
     "verify": command(verify),
     "status": command(status),

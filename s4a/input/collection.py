@@ -197,10 +197,9 @@ def read_shapes(
     >>> list(shapes["original"]), shapes["report"]["status"].values.tolist()
     (['good'], ['excluded', 'ok'])
     """
-    given = {"components": components, "strict": strict, "close_holes": close_holes}
-    for name, value in {**given, "pattern": pattern}.items():
-        check(name, value)
     options = {"components": components, "strict": strict, "close_holes": close_holes}
+    for name, value in {**options, "pattern": pattern}.items():
+        check(name, value)
     system = {"coordinate_system": coordinate_system, "unit": unit}
     with_system(xr.Dataset(), **system)  # an error of the options, not of each file
     label = check_label(label)

@@ -47,9 +47,8 @@ def match_pair(
         Whether to return map and match of every iteration of ZoomOut, and the descriptors of the
         initial map.
     **options
-        ``n_coarse, k_init, k, step, init, initial_refinement, full_resolution_iterations, refine,
-        articulated, refined_eigenfunctions, alignment, sampling, area_weighted, n_projected,
-        method, seed`` or ``rng``.  :class:`s4a.Options` describes them and has their defaults.
+        Those of :class:`s4a.Options` that apply to pairs, such as ``n_coarse``, ``k``, ``refine``
+        and ``seed`` (or ``rng``); the message about another one lists them.
 
     Returns
     -------
