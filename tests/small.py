@@ -22,12 +22,13 @@ def without_pictures(patch):
         patch.setattr(views, "SIZE", (120, 96))  # of the stills of panels
 
 
-def small_pictures(patch):
-    """Let figures have pictures of a fifth of their width."""
-    from s4a.show import charts
+def small_pictures(patch, figures=(72, 60), pages=None):
+    """Let figures, and where a size is given pages, have pictures of few pixels."""
+    from s4a.show import charts, draw, page, pictures
 
-    render = charts.render
-    patch(charts, "render", lambda *a, size, **o: render(*a, size=(72, 60), **o))
+    sizes = {charts: figures} | (dict.fromkeys((page, pictures), pages) if pages else {})
+    for module, few in sizes.items():
+        patch(module, "render", lambda *a, few=few, **o: draw.render(*a, **o | {"size": few}))
 
 
 def small_searches(patch):

@@ -40,6 +40,7 @@ from browsing import (
     watched,
 )
 from paths import NOTEBOOKS
+from small import small_pictures
 
 import s4a
 from s4a.show import panel_page
@@ -795,7 +796,9 @@ def few_values(monkeypatch):
 
 @pytest.fixture(scope="module")
 def study_page(study, tmp_path_factory):
-    return s4a.write_page(study, tmp_path_factory.mktemp("page") / "study.html")
+    with pytest.MonkeyPatch.context() as patch:
+        small_pictures(patch.setattr, pages=(120, 100))
+        return s4a.write_page(study, tmp_path_factory.mktemp("page") / "study.html")
 
 
 @pytest.mark.parametrize("width, height", [(1366, 680), (1920, 1080)])
