@@ -31,7 +31,7 @@ from scipy.spatial import cKDTree
 import s4a
 import s4a_morphometrics
 from s4a import metrics, statistics, synthetic
-from s4a.analysis import permutation, transfer
+from s4a.analysis import permutation
 from s4a.geometry.align import align, cloud, farthest_points
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, vertex_areas
@@ -92,7 +92,7 @@ def brains(folder):
         "nearest vertex after ICP": labels["fsa5"][cKDTree(X @ R.T + t).query(Y)[1]],
     }
     for both in (False, True):
-        study = transfer.register_pairs(
+        study = s4a.register_pairs(
             meshes["fsa5"], {"conte69": meshes["conte69"]}, bidirectional=both
         )
         name = "S4A, matched both ways" if both else "S4A, one way"
@@ -115,7 +115,7 @@ def skulls(folder):
     point = {name: m["landmark_position"].values for name, m in marks.items()}
     error = {"nearest surface point after ICP": [], "S4A": []}
     for a, b in itertools.combinations(meshes, 2):
-        study = transfer.register_pairs(meshes[a], {b: meshes[b]}, name=a)
+        study = s4a.register_pairs(meshes[a], {b: meshes[b]}, name=a)
         for p, q in ((a, b), (b, a)):
             R, t = icp_motion(meshes[p], meshes[q])
             X, T = as_arrays(meshes[q])
@@ -367,7 +367,7 @@ def parcels(folder):
             corner, area = before[1][triangle], vertex_areas(X, T)
             smooth = np.einsum("spc,pc->sp", far[:, corner], weight).argmin(axis=0)
             nearest = label[np.take_along_axis(corner, weight.argmax(axis=1)[:, None], 1)[:, 0]]
-            pair = transfer.register_pairs(source, {"target": target})
+            pair = s4a.register_pairs(source, {"target": target})
             for blur, found in rows.items():
                 node = s4a.transfer_labels(pair, label, blur=blur)["target"]
                 carried = node["label"].values

@@ -439,7 +439,7 @@ class Options:
     bidirectional: bool = registration(True,
         "transfer only: match pairs in both directions and average the results",
         paper=False, section="6.2", instead="a template registered to a shape",
-        see="analysis/transfer", pair=True, more="It is an option of :func:`s4a.register_pairs`")
+        see="study/pair", pair=True, more="It is an option of :func:`s4a.register_pairs`")
     displacement_alignment: str = registration("fitted",
         "rigid alignment to the template before displacements are computed: best fit of the "
         "registered surface (fitted), or the initial alignment (initial)",

@@ -19,9 +19,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 import xarray as xr
-from joblib import delayed
 from scipy.sparse.linalg import cg
-from threadpoolctl import threadpool_limits
 
 from s4a.analysis.inputs import all_registered
 from s4a.geometry.closest import (
@@ -31,17 +29,14 @@ from s4a.geometry.closest import (
     interpolation_matrix,
 )
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas, vertex_normals
-from s4a.input.collection import Mesh, as_meshes
-from s4a.input.coordinates import CoordinateSystem
+from s4a.input.coordinates import CoordinateSystem, in_one_system
 from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, as_landmarks, locate, trace_curves
 from s4a.method.register import common_unit, identity, uncertainty
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
-from s4a.schema import check_type, dataset, in_unit, require
-from s4a.study.pair import log_warning, match_shapes, shape_of
-from s4a.study.processes import workers
-from s4a.study.tree import stack_registration, template_mesh
+from s4a.schema import dataset, in_unit, require
+from s4a.study.pair import log_warning, match_both, shape_of
 
 BLURS = {None: 1.0, "fast": 1.0, "paper": 0.0}  # default of `blur` by preset
 
@@ -215,133 +210,6 @@ def majority(vote: np.ndarray, value: np.ndarray) -> np.ndarray:
     return value[vote.round(6).argmax(1)]  # votes within six digits are ties
 
 
-def pair_study(result: xr.Dataset, source: xr.Dataset, target: xr.Dataset) -> xr.DataTree:
-    """Convert a result of :func:`s4a.match_pair` to a study, with the target as template.
-
-    Parameters
-    ----------
-    result, source, target : Dataset
-        The result, and the two meshes.
-
-    Returns
-    -------
-    DataTree
-        ``/original``, ``/registration``, for the functions of this module.
-    """
-    registered = result.rename(match="registered_match")
-    return _study_of("target", target, {"source": source}, {"source": registered}, {})
-
-
-def _study_of(name, template, shapes, forth, back):
-    """Registered study; `forth` are registrations of the shapes, `back` of the template."""
-    meshes = {name: template, **shapes}
-    nodes = {f"original/{n}": mesh for n, mesh in meshes.items()}
-    files = {name: identity(Shape(template)), **forth}
-    nodes |= stack_registration(template_mesh(template, name), files, list(meshes))
-    return xr.DataTree.from_dict(nodes | {f"reverse/{n}": data for n, data in back.items()})
-
-
-def _shape_of(mesh, options):
-    """Shape of a mesh, with low resolution and spectrum."""
-    with threadpool_limits(1):
-        return shape_of(mesh, options)
-
-
-def _match_both(shape, template, options):
-    """Register the shape to the template and, with `bidirectional`, the template to the shape."""
-    with threadpool_limits(1):
-        forth = match_shapes(shape, template, options)[0]
-        return forth, match_shapes(template, shape, options)[0] if options.bidirectional else None
-
-
-def register_pairs(
-    template: Mesh,
-    shapes: dict[str, Mesh],
-    *,
-    name: str = "template",
-    n_jobs: int | None = None,
-    preset: str | None = None,
-    **options: Any,
-) -> xr.DataTree:
-    """Register a template to each shape without a network (6.2), for transfer.
-
-    Parameters
-    ----------
-    template : path or Dataset
-        Mesh file, or clean mesh, such as :func:`s4a.read_shape` returns.
-    shapes : dict of str to path or Dataset
-        Name -> mesh file, or clean mesh.
-    name : str
-        Name of the template.
-    n_jobs : int, optional
-        Number of parallel processes, as in joblib: -1 for all cores, None for one.  The result does
-        not depend on it.
-    preset : {None, "paper", "fast"}
-        Presets of :func:`s4a.match_pair`.  ``"paper"`` also sets bidirectional=False, and blur=0 in
-        :func:`s4a.transfer_labels`.
-    **options
-        Options of :func:`s4a.match_pair`, and ``bidirectional``.  By default, each pair is matched
-        in both directions, and a transfer averages both.  :class:`s4a.Options` describes them.
-
-    Returns
-    -------
-    DataTree
-        A study with the nodes
-
-        - ``/original``: meshes of the template and of the shapes;
-        - ``/registration``: registration of each shape to the template; the attributes ``status``
-          and ``warning`` of ``/registration/NAME`` flag registrations that are probably wrong, as
-          in :func:`s4a.match_pair`;
-        - ``/reverse``: registration of the template to each shape, with `bidirectional`.
-
-    Raises
-    ------
-    ValueError
-        If a shape has the name of the template, a mesh lacks a variable, or an option is out of
-        range or contradicts the preset.
-
-    See Also
-    --------
-    s4a.match_pair : Match one pair.
-    s4a.analyse : Register a collection by a network.
-    s4a.transfer_labels, s4a.transfer_scalars, s4a.transfer_landmarks : Use the registrations.
-
-    Examples
-    --------
-    >>> import s4a
-    >>> brains = s4a.synthetic.brains(6, 200)
-    >>> source = brains["original/brain_01"].to_dataset()
-    >>> target = brains["original/brain_02"].to_dataset()
-    >>> pairs = s4a.register_pairs(source, {"brain_02": target}, n_coarse=100, k_init=6, k=10)
-    >>> s4a.transfer_labels(pairs, source["label"].values)["brain_02"]["label"].sizes["vertex"]
-    200
-    """
-    check_type(shapes, dict, "shapes")
-    if name in shapes or not shapes:
-        raise ValueError(
-            f"shapes other than the template {name!r} are needed; found "
-            f"{', '.join(shapes) or 'none'}"
-        )
-    settings = given_options({"preset": preset, **options}, pair=True)
-    meshes = as_meshes({name: template, **shapes}, settings)
-    parallel = workers(n_jobs)
-    inside, *others = parallel(delayed(_shape_of)(mesh, settings) for mesh in meshes.values())
-    pairs = parallel(delayed(_match_both)(shape, inside, settings) for shape in others)
-    forth = {n: pair[0] for n, pair in zip(shapes, pairs, strict=True)}
-    back = (
-        {n: pair[1] for n, pair in zip(shapes, pairs, strict=True)}
-        if settings.bidirectional
-        else {}
-    )
-    for n, registration in forth.items():
-        log_warning(registration, n)
-        if n in back:
-            log_warning(back[n], f"{n} in reverse")
-    study = _study_of(name, meshes.pop(name), meshes, forth, back)
-    study["registration"].attrs["preset"] = settings.preset or ""
-    return study
-
-
 def _preset(study: xr.DataTree, given: dict[str, Any]) -> str | None:
     """Preset of a transfer: the given one, else that of the study or of its pairs."""
     if "preset" in given:
@@ -391,9 +259,9 @@ def _routes_from_outside(
             template, study["coarse"][name].to_dataset().load(), **options.of("projection")
         )
     else:
-        inside = _shape_of(template, options)
-    outside = _shape_of(mesh, options)
-    forth, back = _match_both(inside, outside, options)
+        inside = shape_of(template, options)
+    outside = shape_of(mesh, options)
+    forth, back = match_both(inside, outside, options)
     log_warning(forth, f"the registration of {name!r} to the external source")
     routes: list[Route] = [[(link(mesh, template, forth), "down")]]
     if back is not None:
@@ -438,7 +306,9 @@ def plan(
         )
     if isinstance(source, xr.Dataset):
         require(source, "position", "corner_vertex", what="source")
-        mesh, up = source, _routes_from_outside(study, source, options or {})
+        both = {"template": study["original"][template].to_dataset(), "source": source}
+        mesh = in_one_system(both)["source"]
+        up = _routes_from_outside(study, mesh, options or {})
     elif options:
         raise ValueError(
             f"options {', '.join(options)} need an external source, which is matched to the "
@@ -502,7 +372,8 @@ def transfer_labels(
     Parameters
     ----------
     study : DataTree
-        A finished study, or a result of :func:`register_pairs` or :func:`pair_study`.
+        A finished study, or a result of :func:`s4a.register_pairs` or
+        :func:`s4a.study.pair.pair_study`.
     label : array_like (vertex,), or dict of str to array_like
         Numbers or names at the vertices of the source in ``/original`` (see
         :func:`s4a.input.annotations.labels_of_mesh`); or a dict of several sources to their labels,
@@ -521,7 +392,7 @@ def transfer_labels(
         paper, disables diffusion.  The default is 1, or 0 with ``preset="paper"`` of the study or
         of an external source.
     **options
-        Options of :func:`register_pairs` for an external source, including ``preset``.  They
+        Options of :func:`s4a.register_pairs` for an external source, including ``preset``.  They
         replace the options of the study.
 
     Returns
@@ -803,7 +674,8 @@ def correspondence(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
     Parameters
     ----------
     study : DataTree
-        A finished study, or a result of :func:`register_pairs` or :func:`pair_study`.
+        A finished study, or a result of :func:`s4a.register_pairs` or
+        :func:`s4a.study.pair.pair_study`.
     source, target : str
         Names of two shapes of the study; either may be the template.
 

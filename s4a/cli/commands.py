@@ -39,8 +39,12 @@ def check(paths: list[str], **options: Any) -> int:
     paths : PATH
         folders, globs or mesh files
     """
-    report = s4a.read_shapes(paths, **options)["report"].to_dataset()
+    from s4a.input.coordinates import CoordinateSystem, common
+
+    shapes = s4a.read_shapes(paths, **options)
+    report = shapes["report"].to_dataset()
     write(*tables.decision_lines(report), tables.report_table(report))
+    common({name: CoordinateSystem.of(mesh.attrs) for name, mesh in shapes["original"].items()})
     return 0 if (report["status"] != "excluded").all() else 1
 
 

@@ -888,7 +888,7 @@ def _stl_bytes(X, T, _, title=""):
     return f"binary {title}".encode().ljust(80)[:80] + len(T).to_bytes(4, "little") + rows.tobytes()
 
 
-_GIFTI_SPACES = {None: 2, "scanner": 1, "Talairach": 3, "MNI152": 4}  # codes by origin
+_GIFTI_SPACES = {None: 2, "scanner": 1, "MNI152": 4}  # codes by origin
 
 
 def _gifti_bytes(X, T, scalars, title=""):

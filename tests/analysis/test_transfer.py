@@ -25,7 +25,7 @@ from s4a import (
     transfer_scalars,
     write_mesh,
 )
-from s4a.analysis.transfer import diffuse_votes, majority, pair_study, votes_of
+from s4a.analysis.transfer import diffuse_votes, majority, votes_of
 from s4a.geometry.closest import (
     closest_facing_point,
     closest_point,
@@ -43,6 +43,7 @@ from s4a.input.annotations import (
 from s4a.input.landmarks import locate
 from s4a.schema import dataset
 from s4a.study import quality_control
+from s4a.study.pair import pair_study
 
 OPTIONS = {"n_coarse": 1200, "k": 60}
 
@@ -385,6 +386,7 @@ def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
     np.save(tmp_path / "half.npy", np.array([0.5, 1]))
     np.savez(tmp_path / "two.npz", p=np.arange(4), q=np.arange(4))
     (tmp_path / "a.csv").write_text("p,q\n1,2\n")
+    (tmp_path / "twice.csv").write_text("label,label\n1,2\n")
     (tmp_path / "lh.label").write_text("#!ascii label  , from subject\n1\n99 1 2 3 0\n")
     for name, n, text in (
         ("lh.label", 5, "one label for every vertex expected, found some vertices"),
@@ -396,7 +398,8 @@ def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
             r"one array of 4 values needed, found p \(4,\), q \(4,\); name it as two.npz:NAME",
         ),
         ("two.npz:r", 4, "array .r. needed, found p, q"),
-        ("a.csv", 1, "a column 'label' needed, found p, q"),
+        ("a.csv", 1, "one column 'label' needed, found p, q"),
+        ("twice.csv", 1, "one column 'label' needed, found label, label"),
         ("none.npy", 1, "no file .*none.npy"),
     ):
         with pytest.raises(ValueError, match=text):
