@@ -10,10 +10,10 @@ import contextlib
 import os
 import sys
 import tempfile
+from functools import partial
 
-import numpy as np
 import pytest
-from small import OPTIONS
+from small import OPTIONS, without_pictures
 
 import s4a
 from s4a import analyse, coarsen, open_study, spectrum, synthetic
@@ -26,11 +26,6 @@ os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
 sys.modules["rfc3987_syntax"] = None
 # what a test reads, the system has, before it is on the disk
 os.fsync = lambda handle: None
-
-
-@pytest.fixture(scope="session")
-def example_study():
-    return synthetic.example_study()
 
 
 @pytest.fixture(autouse=True)
@@ -61,9 +56,12 @@ def meshes(brains):
 @pytest.fixture(scope="session")
 def brain_files(brains, tmp_path_factory):
     """The brains as PLY files."""
-    paths = synthetic.write(brains, tmp_path_factory.mktemp("brains"))
-    paths[0].with_name("truth.nc").unlink()
-    return paths
+
+    def make(folder):
+        synthetic.write(brains, folder)
+        (folder / "truth.nc").unlink()
+
+    return sorted(made_once(tmp_path_factory, "brains", make).glob("*.ply"))
 
 
 def made_once(tmp_path_factory, name, make):
@@ -92,6 +90,19 @@ def study_folder(brains, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def example_study(tmp_path_factory):
+    """The study of examples, which is in memory."""
+
+    def make(folder):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(synthetic, "analyse", partial(analyse, store=folder))
+            synthetic.example_study().close()
+
+    with open_study(made_once(tmp_path_factory, "study_of_examples", make)) as tree:
+        return tree.load()
+
+
+@pytest.fixture(scope="session")
 def structures_folder(tmp_path_factory):
     """The folder of the example study of several structures."""
     from s4a_morphometrics import analyse_structures
@@ -113,9 +124,14 @@ def study(study_folder):
 
 
 @pytest.fixture(scope="session")
-def study_of_files(brain_files):
+def study_of_files(brain_files, tmp_path_factory):
     """The study of the files, whose positions are rounded to single precision."""
-    return analyse(brain_files, **OPTIONS)
+
+    def make(folder):
+        analyse(brain_files, store=folder, **OPTIONS).close()
+
+    with open_study(made_once(tmp_path_factory, "study_of_files", make)) as tree:
+        return tree.load()
 
 
 @pytest.fixture(scope="session")
@@ -140,10 +156,15 @@ def short_films(monkeypatch):
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Pages have pictures of a few pixels; those that are looked at have tests of their own."""
-    from s4a.show import page, pictures
+    without_pictures(monkeypatch)
 
-    for module in (page, pictures):
-        monkeypatch.setattr(module, "render", lambda *a, **options: np.zeros((2, 2, 4), np.uint8))
+
+@pytest.fixture(scope="module")
+def no_pictures_in_module():
+    """The same for all tests of a module that comes first to pages."""
+    with pytest.MonkeyPatch.context() as patch:
+        without_pictures(patch)
+        yield
 
 
 def pytest_terminal_summary(terminalreporter):
@@ -168,9 +189,9 @@ def pytest_terminal_summary(terminalreporter):
 
 # files that take long begin first, the longest before all, so that no worker waits for the other
 SLOW = """
-notebooks browser site interruptions several pages complete properties widgets faults panels_browser
-pipeline scenes_browser quality_control study_files insert reflect leave_one_out cluster clean
-scalable_study landmarks labels asymmetry view subjects plausibility save_browser kills release
+notebooks browser site pages interruptions faults panels_browser widgets several complete pipeline
+scenes_browser quality_control reflect scalable_study leave_one_out insert study_files labels cli
+landmarks cluster asymmetry subjects plausibility initial_map steps compare two_block save_browser
 """.split()
 
 

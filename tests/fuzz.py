@@ -578,12 +578,7 @@ def work(task):
     logging.disable(logging.WARNING)  # of tiny surfaces that have few eigenfunctions
     table = seeds()
     path = Path(task["folder"]) / "none"
-    read_all = {
-        "mesh": b"OFF",
-        "labels": b"1",
-        "landmarks": b"0 0 0",
-        "subjects": b"shape",
-    }
+    read_all = {"mesh": b"OFF", "labels": b"1", "landmarks": b"0 0 0", "subjects": b"shape"}
     for kind, data in read_all.items():  # so that nothing is imported under the limit
         path.write_bytes(data)
         try:
@@ -704,9 +699,7 @@ def child(task, folder):
     }
     with open(out, "wb") as lines:
         process = subprocess.Popen(
-            [sys.executable, __file__, "--work", json.dumps(task)],
-            stdout=lines,
-            env=environment,
+            [sys.executable, __file__, "--work", json.dumps(task)], stdout=lines, env=environment
         )
         seen, since, code = "", time.monotonic(), None
         while code is None:

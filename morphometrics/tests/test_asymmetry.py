@@ -336,7 +336,7 @@ def test_p_values_of_a_mean_of_zero_are_uniform():
 @pytest.mark.parametrize("deviations", [[1, 1, 1, 1, 1, 1], [9, 2, 1, 1, 1, 1], [1]])
 def test_p_of_antisymmetry_is_uniform_for_normal_individuals_of_any_covariance(deviations):
     rng = np.random.default_rng(len(deviations))
-    drawn = rng.normal(size=(400, 15, len(deviations))) * deviations
+    drawn = rng.normal(size=(150, 15, len(deviations))) * deviations
     found = [antisymmetry_test(individuals)[1] for individuals in drawn]
     assert stats.kstest(found, "uniform").pvalue > 0.01
 

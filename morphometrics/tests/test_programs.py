@@ -306,9 +306,7 @@ def test_landmarks_of_the_other_frame_are_written_in_the_frame_of_the_template(s
     name = study["registration"].attrs["template"]
     Y = study["original"][name]["position"].values[[5, 200, 400]]
     given = dataset(
-        {"coordinate_system": "LPS"},
-        landmark_name=list("abc"),
-        landmark_position=Y * [-1, -1, 1],
+        {"coordinate_system": "LPS"}, landmark_name=list("abc"), landmark_position=Y * [-1, -1, 1]
     )
     write_for(study, tmp_path, "slicer", n_points=5, landmarks=given)
     written = read_landmarks(tmp_path / "landmarks" / f"{name}.mrk.json")

@@ -142,14 +142,8 @@ def test_the_command_takes_a_region_and_a_nuisance(study_folder, tmp_path, capsy
     with open(table, "w") as file:
         names = [path.stem for path in sorted((study_folder / "original").glob("*.nc"))]
         file.write("shape,age\n" + "\n".join(f"{n},{20 + i**2}" for i, n in enumerate(names)))
-    command = [
-        "region-statistics",
-        str(study_folder),
-        "--table",
-        str(table),
-        "--out",
-        str(tmp_path / "o"),
-    ]
+    flags = ["--table", str(table), "--out", str(tmp_path / "o")]
+    command = ["region-statistics", str(study_folder), *flags]
     assert cli.main([*command, "--regress-out", "age", "--min-confidence", "0.2"]) == 0
     assert "without age" in capsys.readouterr().out
     assert cli.main([*command, "--region", "999"]) == 2

@@ -151,7 +151,7 @@ def test_hardly_a_triangle_is_inverted_where_all_scores_are_three(scores):
 
 
 def test_nearest_neighbours_after_icp_are_wrong_by_two_to_four_percent():
-    tree = synthetic.brains(12, 8000)
+    tree = synthetic.brains(8, 5000)
     truth, error = tree["truth"], []
     shapes = truth["shape"].values
     for a, b in [

@@ -174,10 +174,7 @@ def test_what_is_wrong_is_said(three_brains):
         compare(source, target, methods=["ICP"])
     with pytest.raises(ValueError, match=r"the methods kNN.*found RE-MATCH refined, registered"):
         compare(source, target, methods=["kNN", *comparison.METHODS[-3:]], preset="paper")
-    with pytest.raises(
-        ValueError,
-        match="preset 'paper' sets full_resolution_iterations=0",
-    ):
+    with pytest.raises(ValueError, match="preset 'paper' sets full_resolution_iterations=0"):
         compare(source, target, preset="paper", full_resolution_iterations=1)
     with pytest.raises(ValueError, match="init must be one of 'landmarks', 'descriptors'"):
         compare(source, target, init="dense")
@@ -271,13 +268,8 @@ def test_the_command_writes_table_file_and_figure(tmp_path, capsys):
     for name, points in (("source", marks), ("target", marks[::-1])):
         rows = "\n".join(f"{i},{x},{y},{z}" for i, (x, y, z) in enumerate(points))
         (tmp_path / f"{name}.csv").write_text("name,x,y,z\n" + rows)
-    given = [
-        "--methods",
-        "RE-MATCH",
-        "--landmarks",
-        str(tmp_path / "source.csv"),
-        str(tmp_path / "target.csv"),
-    ]
+    files = [str(tmp_path / f"{name}.csv") for name in ("source", "target")]
+    given = ["--methods", "RE-MATCH", "--landmarks", *files]
     assert main(["compare", one, two, *given, *options]) == 0
     assert "RE-MATCH" in capsys.readouterr().out
     assert main(["compare", one, two, *given[:-1], *options]) == 2

@@ -43,7 +43,7 @@ def test_a_surface_without_crossings_has_none_in_any_pose_and_unit():
 
 
 def test_two_spheres_cross_where_edges_of_one_pass_through_triangles_of_the_other():
-    X, T = two(*sphere(200), [0.31, 0.17, 0.43])
+    X, T = two(*sphere(120), [0.31, 0.17, 0.43])
     expected = segments_through(X, T)
     assert expected.sum() > 20
     assert count_crossing(X, T) == expected.sum()

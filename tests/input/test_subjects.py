@@ -109,8 +109,8 @@ def test_rows_without_a_shape_are_ignored_and_shapes_without_a_row_lack_values(t
     assert "no row, so all values are missing: b" in caplog.text
 
 
-def test_statistics_leave_out_a_shape_that_has_no_row_in_the_table(caplog):
-    study = synthetic.example_study()
+def test_statistics_leave_out_a_shape_that_has_no_row_in_the_table(example_study, caplog):
+    study = example_study.copy()
     names = study["registration"]["shape"].values.tolist()
     study["subjects"] = subjects({"age": np.arange(5) ** 2}, names[1:])
     result = statistics.regression(study, "age", n_permutations=19)
@@ -231,24 +231,11 @@ def test_the_command_prints_tables_and_writes_files(folder, capsys, monkeypatch)
         "s4a.write_page",
         lambda tree, file, **_: file.write_text(str(tree["pca"].sizes["component"])),
     )
-    command = [
-        "statistics",
-        str(folder / "study"),
-        "--group",
-        "sex",
-        "--regress-on",
-        "age",
-        "--permutations",
-        "19",
-    ]
-    assert cli.main(command) == 0
+    flags = "--group sex --regress-on age --permutations 19".split()
+    assert cli.main(["statistics", str(folder / "study"), *flags]) == 0
     message, out = capsys.readouterr().out, folder / "study" / "statistics"
-    for words in (
-        "groups of sex (f: 3, m: 3)",
-        "family-wise",
-        "outliers:",
-        "others: lengths in mm",
-    ):
+    head = "groups of sex (f: 3, m: 3)"
+    for words in (head, "family-wise", "outliers:", "others: lengths in mm"):
         assert words in message, words
     assert (out / "regression.html").read_text() == "1"
     assert (out / "regression.gif").read_bytes()[:3] == b"GIF"
@@ -284,15 +271,8 @@ def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
     mesh = brains["brain_07"]
     write_mesh(tmp_path / "brain_07.ply", *as_arrays(mesh), coordinate_system="RAS", unit="mm")
     (tmp_path / "broken.ply").write_text("no mesh")
-    command = [
-        "insert",
-        str(folder / "study"),
-        str(tmp_path),
-        "--out",
-        str(tmp_path / "out"),
-        "--n-jobs",
-        "1",
-    ]
+    out = ["--out", str(tmp_path / "out"), "--n-jobs", "1"]
+    command = ["insert", str(folder / "study"), str(tmp_path), *out]
     assert cli.main(command) == 1  # one of them is excluded
     message = capsys.readouterr().out.splitlines()
     assert message[0].split()[:4] == ["shape", "confidence", "round", "trip"]
@@ -314,10 +294,7 @@ def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
     [
         ("shape,âge\na,1\n".encode("utf-16"), "found UTF-16: save it as CSV UTF-8"),
         ("shape,age\na,1\n".encode("utf-16-le"), "found UTF-16: save it as CSV UTF-8"),
-        (
-            "shape,age\nà,1\n".encode("latin-1"),
-            "byte 0xe0 in line 2: .* Latin-1 .* 'à'",
-        ),
+        ("shape,age\nà,1\n".encode("latin-1"), "byte 0xe0 in line 2: .* Latin-1 .* 'à'"),
         (b"shape,age\na,1\0\n", "the byte 0 in line 2: the file seems to be binary or damaged"),
         (b"PK\x03\x04\x14\0", "found a workbook or an archive: export it as CSV UTF-8"),
         (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "found a workbook or an archive"),

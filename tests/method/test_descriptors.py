@@ -42,10 +42,7 @@ def shape(brains):
 def test_signatures_are_those_of_pyfm_at_its_own_settings(shape):
     signatures = pytest.importorskip("pyFM.signatures")
     Phi, _, ev, _, _ = shape
-    for ours, theirs in (
-        (fmap.hks, signatures.auto_HKS),
-        (fmap.wks, signatures.auto_WKS),
-    ):
+    for ours, theirs in ((fmap.hks, signatures.auto_HKS), (fmap.wks, signatures.auto_WKS)):
         for landmark in (None, np.array([5, 70, 300])):
             found, expected = (
                 ours(Phi, ev, n=30, landmark=landmark),

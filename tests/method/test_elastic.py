@@ -237,9 +237,7 @@ def test_the_order_of_converging_initialisations_does_not_matter(pair):
     assert np.allclose(one, other, atol=1e-9)
 
 
-def test_less_stiff_iterations_are_more_accurate_for_a_strained_template(
-    monkeypatch,
-):
+def test_less_stiff_iterations_are_more_accurate_for_a_strained_template(monkeypatch):
     tree = synthetic.brains(4, 2500, seed=25)
     template, shape = (tree[f"original/brain_{i:02d}"].to_dataset() for i in (3, 4))
     at = tree["truth/brain_03/reference_point"].values

@@ -71,11 +71,7 @@ def chosen_by_definition(distance, n_pairs):
     near = [sorted({*range(n)} - {i}, key=lambda j, i=i: (distance[i, j], j)) for i in range(n)]
     rest = sorted(
         itertools.combinations(range(n), 2),
-        key=lambda p: (
-            min(near[p[0]].index(p[1]), near[p[1]].index(p[0])),
-            distance[p],
-            p,
-        ),
+        key=lambda p: (min(near[p[0]].index(p[1]), near[p[1]].index(p[0])), distance[p], p),
     )
     wanted = [tuple(sorted(pair)) for pair in (*edges, *closing, *rest)]
     return sorted([*dict.fromkeys(wanted)][:n_pairs])

@@ -217,10 +217,7 @@ def test_size_can_be_removed_from_the_displacement(shapes):
             {"refine": "both"},
             "refine must be one of 'elastic', 'spectral_icp', 'intrinsic'; found 'both'",
         ),
-        (
-            {"init": "random"},
-            "init must be one of 'dense', 'landmarks', 'wave_kernels'; found",
-        ),
+        ({"init": "random"}, "init must be one of 'dense', 'landmarks', 'wave_kernels'; found"),
         ({"k_init": 0}, "k_init must be an integer of at least 4; found 0"),
         ({"k": 10}, "k must be at least k_init = 20; found 10"),
     ],

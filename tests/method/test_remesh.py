@@ -8,14 +8,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from s4a.geometry.mesh import (
-    as_arrays,
-    as_dataset,
-    edge_graph,
-    edges,
-    unique_edges,
-    vertex_areas,
-)
+from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, unique_edges, vertex_areas
 from s4a.input.clean import clean
 from s4a.method.remesh import coarsen
 from s4a.method.spectral import spectrum

@@ -164,10 +164,10 @@ def test_the_wheel_holds_the_package_alone_and_uvx_runs_its_demo(tmp_path, monke
     env |= {"UV_CACHE_DIR": str(tmp_path / "cache"), "UV_NO_CONFIG": "1"}
     run = [sys.executable, "-m", "uv", "tool", "run", "--offline", "--no-index"]
     run += ["--find-links", str(index), "--python", sys.executable, "s4a", "demo"]
-    run += ["--shapes", "3", "--vertices", "500", "--n-jobs", "1"]
+    run += ["--shapes", "2", "--vertices", "300", "--n-jobs", "1"]
     found = subprocess.run(run, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stderr
-    assert {"modes.png", "study.html"} <= {path.name for path in (tmp_path / "demo").iterdir()}
+    assert (tmp_path / "demo" / "study.html").exists()
 
 
 # ---- Binder

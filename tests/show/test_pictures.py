@@ -89,9 +89,9 @@ def test_the_scale_of_nonnegative_numbers_begins_at_0_in_white(tmp_path):
     assert len(reddest(frames[150:190])) == 0
 
 
-def test_a_panel_is_drawn_in_its_current_state_without_a_browser(tmp_path):
+def test_a_panel_is_drawn_in_its_current_state_without_a_browser(example_study, tmp_path):
     widgets = pytest.importorskip("s4a.widgets")
-    panel = widgets.FunctionalMap(s4a.synthetic.example_study())
+    panel = widgets.FunctionalMap(example_study)
     first = pixels(s4a.write_picture(panel, tmp_path / "a.png", width=300))
     panel.cell = (3, 3)
     second = pixels(s4a.write_picture(panel, tmp_path / "b.png", width=300))
@@ -100,9 +100,9 @@ def test_a_panel_is_drawn_in_its_current_state_without_a_browser(tmp_path):
     panel.close()
 
 
-def test_every_panel_with_a_surface_is_drawn_and_of_tabs_the_selected_one(tmp_path):
+def test_every_panel_with_a_surface_is_drawn_and_of_tabs_the_selected_one(example_study, tmp_path):
     panels = pytest.importorskip("s4a.widgets.explore")
-    tabs = panels.explore(s4a.synthetic.example_study())
+    tabs = panels.explore(example_study)
     sizes = []
     for title in panels.PANELS:
         panel = tabs[title]

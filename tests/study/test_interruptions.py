@@ -88,11 +88,9 @@ IN_NATIVE_CODE = 4  # files that are written when workers are there; none: while
 @pytest.mark.parametrize(
     "how, who, n_files",
     [
-        (signal.SIGINT, os.kill, 0),  # as from a notebook: the workers do not get it
         (signal.SIGKILL, os.kill, 0),
-        (signal.SIGINT, os.kill, IN_NATIVE_CODE),
-        (signal.SIGTERM, os.kill, IN_NATIVE_CODE),
-        (signal.SIGKILL, os.kill, IN_NATIVE_CODE),
+        (signal.SIGINT, os.kill, IN_NATIVE_CODE),  # as from a notebook: the workers do not get it
+        (signal.SIGKILL, os.kill, IN_NATIVE_CODE),  # SIGTERM ends it as suddenly
         (signal.SIGHUP, os.killpg, IN_NATIVE_CODE),  # as when a terminal is closed
     ],
 )
@@ -210,28 +208,19 @@ KILLS = [
 ]
 
 
-def test_a_run_killed_in_every_stage_ends_with_the_same_study(files, whole, tmp_path):
+def test_a_run_killed_again_and_again_ends_with_the_same_study(files, whole, tmp_path):
+    kills = KILLS[::3]  # the same happens in every stage with a full disk, below
     flags = [*FLAGS, "--no-intersections"]
-    script = [
-        sys.executable,
-        "-c",
-        KILLED,
-        tmp_path / "log",
-        tmp_path / "study",
-        ",".join(KILLS),
-        *files,
-        *flags,
-    ]
-    subprocess.run(script, check=True, capture_output=True)
+    where = [tmp_path / "log", tmp_path / "study", ",".join(kills)]
+    subprocess.run(
+        [sys.executable, "-c", KILLED, *where, *files, *flags], check=True, capture_output=True
+    )
     messages = (tmp_path / "log").read_text().splitlines()
     killed = [line for line in messages if line[:6] == "killed"]
-    assert killed == [f"killed {file}" for file in KILLS]
+    assert killed == [f"killed {file}" for file in kills]
     result = contents(tmp_path / "study")
-    shared = {
-        "network.nc",
-        "registration.nc",
-        "pca.nc",
-    }  # tasks of two files or none: computed again, with the same result
+    # tasks of two files or none: computed again, with the same result
+    shared = {"network.nc", "registration.nc", "pca.nc"}
     for file in set(result) - shared:
         assert messages.count(f"written {file}") == 1, file
     assert not list((tmp_path / "study").rglob(".*.tmp"))
@@ -370,66 +359,71 @@ def assert_equal_but_paths(folder, whole):
         assert result[file].equals(whole[file]), file
 
 
-@pytest.mark.parametrize(
-    "error, stage",
-    [
-        (IndexError("list index\nout of range"), "clean_shape"),
-        (MemoryError(), "compare_shape"),
-        (RecursionError(), "remesh_shape"),
-        (SystemExit(0), "align_shape"),
-        (KeyError("k"), "register_shape"),
-    ],
-)
+ERRORS = {
+    "clean_shape": IndexError("list index\nout of range"),
+    "compare_shape": MemoryError(),
+    "remesh_shape": RecursionError(),
+    "align_shape": SystemExit(0),
+    "register_shape": KeyError("k"),
+}
+
+
 def test_an_error_in_the_task_of_a_shape_excludes_the_shape_with_a_warning(
-    files, tmp_path, monkeypatch, capsys, error, stage
+    tmp_path, monkeypatch, capsys
 ):
-    module = {"compare_shape": quality_control}.get(stage, pipeline)
-    task = getattr(module, stage)
+    meshes = synthetic.write(synthetic.brains(7, 300, seed=2), tmp_path / "meshes")
+    failing = dict(zip(ERRORS, sorted(file.stem for file in meshes)[1:], strict=False))
+    command = ["run", *map(str, meshes), "--out", str(tmp_path / "study")]
+    command += ["--template", "brain_01", *FLAGS, "--no-intersections"]
+    with monkeypatch.context() as patch:
+        for stage, name in failing.items():
+            module = {"compare_shape": quality_control}.get(stage, pipeline)
+            task = getattr(module, stage)
 
-    def wrong(*arguments):
-        if any("brain_02" in str(argument)[-20:] for argument in arguments[:2]):
-            raise error
-        return task(*arguments)
+            def wrong(*arguments, task=task, stage=stage, name=name):
+                if any(name in str(argument)[-20:] for argument in arguments[:2]):
+                    raise ERRORS[stage]
+                return task(*arguments)
 
-    monkeypatch.setattr(module, stage, wrong)
-    folder = tmp_path / "study"
-    assert cli.main(["run", *map(str, files), "--out", str(folder), *FLAGS]) == 1
-    expected_text = capsys.readouterr().out
-    with open_study(folder) as tree:
+            patch.setattr(module, stage, wrong)
+        assert cli.main(command) == 1
+    printed = capsys.readouterr().out
+    logs = []
+    with open_study(tmp_path / "study") as tree:
         report = tree["report"].to_dataset()
-        assert report["status"].values.tolist()[1] == "excluded"
-        reason = report["reason"].values[1]
-        assert type(error).__name__ in reason
-        assert "\n" not in reason
-        assert tree["registration"]["shape"].values.tolist() == ["brain_01", "brain_03"]
-    assert type(error).__name__ in expected_text
-    log = folder / re.search(r"see (\S+\.txt) in the folder of the study", reason)[1]
-    assert log.read_text().startswith("Traceback")
-    assert "in wrong" in log.read_text()
-    monkeypatch.setattr(module, stage, task)
-    assert cli.main(["run", *map(str, files), "--out", str(folder), *FLAGS]) == 0
-    assert not log.exists()
+        excluded = report["shape"].values[report["status"].values == "excluded"]
+        assert excluded.tolist() == sorted(failing.values())
+        assert tree["registration"]["shape"].values.tolist() == ["brain_01", "brain_07"]
+        for stage, name in failing.items():
+            error, reason = type(ERRORS[stage]).__name__, report["reason"].sel(shape=name).item()
+            assert error in reason
+            assert "\n" not in reason
+            assert error in printed
+            log = re.search(r"see (\S+\.txt) in the folder of the study", reason)[1]
+            logs.append(tmp_path / "study" / log)
+            assert logs[-1].read_text().startswith("Traceback")
+            assert "in wrong" in logs[-1].read_text()
+    assert cli.main(command) == 0
+    assert not any(log.exists() for log in logs)
 
 
-@pytest.mark.parametrize("stage", ["map_pairs", "consistent_maps", "pca_without"])
 def test_an_error_in_a_stage_of_all_shapes_ends_the_run_in_one_line_and_keeps_what_is_finished(
-    files, whole, tmp_path, monkeypatch, capsys, stage
+    files, whole, tmp_path, monkeypatch, capsys
 ):
-    step = getattr(pipeline, stage)
-
     def wrong(*_, **__):
         raise TypeError("of the program")
 
-    monkeypatch.setattr(pipeline, stage, wrong)
     folder = tmp_path / "study"
     arguments = ["run", *map(str, files), "--out", str(folder), *FLAGS, "--no-intersections"]
-    assert cli.main(arguments) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("s4a: ")]
-    assert len(lines) == 1
-    assert "TypeError: of the program" in lines[0]
-    logs = [path for path in (folder / ".log").rglob("*.txt") if path.name in lines[0]]
-    assert "in wrong" in logs[0].read_text()
-    monkeypatch.setattr(pipeline, stage, step)
+    for stage in ("map_pairs", "consistent_maps", "pca_without"):
+        with monkeypatch.context() as patch:
+            patch.setattr(pipeline, stage, wrong)
+            assert cli.main(arguments) == 2
+        lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("s4a: ")]
+        assert len(lines) == 1
+        assert "TypeError: of the program" in lines[0]
+        logs = [path for path in (folder / ".log").rglob("*.txt") if path.name in lines[0]]
+        assert "in wrong" in logs[0].read_text()
     assert cli.main(arguments) == 0
     assert_the_same(folder, whole)
     assert not list(folder.glob(".log/**/*.txt"))
@@ -556,15 +550,13 @@ import resource, sys
 from s4a import cli
 resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
 small = ["--n-coarse", "150", "--k-init", "8", "--k", "12", "--no-intersections"]
-small += ["--n-jobs", sys.argv[1]]
-sys.exit(cli.main(["run", *sys.argv[3:], "--out", sys.argv[2], *small]))
+sys.exit(cli.main(["run", *sys.argv[2:], "--out", sys.argv[1], *small, "--n-jobs", "2"]))
 """
 
 
-@pytest.mark.parametrize("n_jobs", [1, 2])
-def test_a_full_disk_is_one_error_and_leaves_complete_files(files, tmp_path, n_jobs):
+def test_a_full_disk_is_one_error_of_two_workers_and_leaves_complete_files(files, tmp_path):
     folder = tmp_path / "study"
-    arguments = [sys.executable, "-c", FULL, str(n_jobs), str(folder), *map(str, files[:2])]
+    arguments = [sys.executable, "-c", FULL, str(folder), *map(str, files[:2])]
     result = subprocess.run(arguments, capture_output=True, text=True, check=False)
     assert result.returncode == 2, result.stderr
     lines = [line for line in result.stderr.splitlines() if line.startswith("s4a: ")]

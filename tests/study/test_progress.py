@@ -12,16 +12,15 @@ from s4a.study import pipeline, progress, tasks
 from s4a.study.progress import FILE, STAGES, status
 
 
-def test_a_finished_run_has_done_all_of_every_stage(brains, tmp_path, capsys):
-    analyse(brains, store=tmp_path, **OPTIONS).close()  # one that no other test has run again
-    result = status(tmp_path)
+def test_a_finished_run_has_done_all_of_every_stage(study_folder, capsys):
+    result = status(study_folder)
     assert result.state == "finished"
     assert tuple(result.stages) == STAGES
     assert all(stage.done == stage.all and stage.ended for stage in result.stages.values())
     assert result.stages["registration"].all == 4
     assert result.failures == {}
     assert (result.memory, result.processes) == (0, 0)
-    assert cli.main(["status", str(tmp_path)]) == 0
+    assert cli.main(["status", str(study_folder)]) == 0
     first, _, *lines = capsys.readouterr().out.splitlines()
     assert first.startswith("finished at 20")
     assert [line.split("  ")[0] for line in lines] == list(STAGES)
@@ -99,13 +98,11 @@ def test_a_run_without_process_is_stopped_and_one_of_another_machine_elsewhere(n
     assert max(map(len, lines)) < 130
 
 
-@pytest.mark.parametrize(
-    "text", ["", "{", "[]", "null", '{"stages": {}}', '{"stages": {"a": [1]}}', "\xff"]
-)
-def test_a_note_of_another_form_is_refused(tmp_path, text):
-    (tmp_path / FILE).write_bytes(text.encode("latin-1"))
-    with pytest.raises(ValueError, match=r"\.progress\.json"):
-        status(tmp_path)
+def test_a_note_of_another_form_is_refused(tmp_path):
+    for text in (b"", b"{", b"[]", b"null", b'{"stages": {}}', b'{"stages": {"a": [1]}}', b"\xff"):
+        (tmp_path / FILE).write_bytes(text)
+        with pytest.raises(ValueError, match=r"\.progress\.json"):
+            status(tmp_path)
 
 
 def test_a_folder_without_a_run_is_an_error(tmp_path, capsys):

@@ -2,32 +2,23 @@
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from s4a import analyse, clean, coarsen, match_pair, spectrum, synthetic
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 
-SEED = st.integers(0, 2**32 - 1)
-UNIT = st.sampled_from([1e-3, 1e-2, 1.0, 25.4, 1e3])
-ANGLE = st.floats(-3.0, 3.0)
-SHIFT = st.floats(-300.0, 300.0)
-PLACE = st.tuples(SHIFT, SHIFT, SHIFT)
-MOTION = st.tuples(st.tuples(ANGLE, ANGLE, ANGLE), PLACE)
-TURNED = st.tuples(
-    st.tuples(*3 * [st.floats(-0.4, 0.4)]), PLACE
-)  # two by 40 degrees: from 90 on the pose counts
+UNITS = (1e-3, 1e-2, 1.0, 25.4, 1e3)
 
 
-def few(n):
-    """Settings for n examples, the same every time."""
-    checks = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-    how = {
-        "phases": [Phase.generate],
-        "suppress_health_check": checks,
-    }  # to shrink an example takes minutes
-    return settings(max_examples=n, derandomize=True, database=None, deadline=None, **how)
+def drawn(seed, largest=3.0):
+    """A rotation vector of such entries at most, a translation, and a unit."""
+    rng = np.random.default_rng(seed)
+    turn, shift = rng.uniform(-largest, largest, 3), rng.uniform(-300, 300, 3)
+    return (turn, shift), rng.choice(UNITS)
+
+
+# two that are turned by 40 degrees at most each: from 90 on the pose counts
+LITTLE = 0.4
 
 
 def moved(X, transform, unit=1.0):
@@ -63,9 +54,9 @@ def size_of(X, T):
     return np.sqrt(vertex_areas(X, T).sum())
 
 
-@given(transform=MOTION, unit=UNIT, seed=SEED)
-@few(10)
-def test_cleaning_a_dirty_surface(brains, transform, unit, seed):
+@pytest.mark.parametrize("seed", range(4))
+def test_cleaning_a_dirty_surface(brains, seed):
+    transform, unit = drawn(seed)
     X, T = next(iter(brains.values()))
     X = np.vstack(
         [X, X[:40], X[0] + [[500, 0, 0], [501, 0, 0], [500, 1, 0]], X[:3]]
@@ -97,9 +88,9 @@ def test_cleaning_a_dirty_surface(brains, transform, unit, seed):
     assert size_of(*as_arrays(other)) / unit == pytest.approx(size_of(*as_arrays(one)), rel=1e-8)
 
 
-@given(transform=MOTION, unit=UNIT, seed=SEED)
-@few(10)
-def test_the_spectrum_at_low_resolution(brains, transform, unit, seed):
+@pytest.mark.parametrize("seed", range(3))
+def test_the_spectrum_at_low_resolution(brains, seed):
+    transform, unit = drawn(seed)
     X, T = next(iter(brains.values()))
     one = spectrum(coarsen(as_dataset(X, T), n_coarse=300), k=12)
     Y, S, _ = renumbered(moved(X, transform, unit), T, seed)
@@ -113,22 +104,16 @@ def test_the_spectrum_at_low_resolution(brains, transform, unit, seed):
 OPTIONS = {"n_coarse": 300, "k_init": 8, "k": 20}
 
 
-@pytest.fixture(scope="module")
-def pair(brains):
-    """The displacement of a pair as it is."""
-    source, target = list(brains.values())[:2]
-    return match_pair(as_dataset(*source), as_dataset(*target), **OPTIONS)["displacement"].values
-
-
-@given(transforms=st.tuples(TURNED, TURNED), unit=UNIT, seed=SEED)
-@few(4)
-def test_the_displacement_of_a_pair(brains, pair, transforms, unit, seed):
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_displacement_of_a_pair(brains, seed):
     (X, T), (Y, S) = list(brains.values())[:2]
+    as_it_is = match_pair(as_dataset(X, T), as_dataset(Y, S), **OPTIONS)["displacement"].values
     size = size_of(Y, S)
-    X, T, _ = renumbered(moved(X, transforms[0], unit), T, seed)
-    Y, S, order = renumbered(moved(Y, transforms[1], unit), S, seed + 1)
+    (one, unit), (other, _) = (drawn(2 * seed + i, LITTLE) for i in range(2))
+    X, T, _ = renumbered(moved(X, one, unit), T, seed)
+    Y, S, order = renumbered(moved(Y, other, unit), S, seed + 1)
     result = match_pair(as_dataset(X, T), as_dataset(Y, S), **OPTIONS)["displacement"].values / unit
-    wanted = Rotation.from_rotvec(transforms[1][0]).apply(pair[order])
+    wanted = Rotation.from_rotvec(other[0]).apply(as_it_is[order])
     # the displacement is kept in single precision
     assert np.linalg.norm(result - wanted, axis=1).max() < 1e-5 * size
 
@@ -136,24 +121,16 @@ def test_the_displacement_of_a_pair(brains, pair, transforms, unit, seed):
 OF_STUDY = {"n_coarse": 300, "k_init": 12, "k": 20, "intersections": False}
 
 
-@pytest.fixture(scope="module")
-def collection():
-    """Four shapes as (points, triangles), and their study."""
+def test_the_study_of_a_collection():
     tree = synthetic.brains(4, 1200, seed=2)["original"]
     shapes = {name: as_arrays(mesh) for name, mesh in tree.children.items()}
-    return shapes, analyse(shapes, **OF_STUDY)
-
-
-@given(transforms=st.tuples(*4 * [TURNED]), unit=UNIT, seed=SEED, order=st.permutations(range(4)))
-@few(3)
-def test_the_study_of_a_collection(collection, transforms, unit, seed, order):
-    shapes, one = collection
+    one, unit = analyse(shapes, **OF_STUDY), 25.4
     names, given, old_vertex = list(shapes), {}, {}
-    for i in order:
+    transforms = [drawn(seed, LITTLE)[0] for seed in range(4)]
+    for i in (2, 0, 3, 1):
         X, T = shapes[names[i]]
-        *given[names[i]], old_vertex[names[i]] = renumbered(
-            moved(X, transforms[i], unit), T, seed + i
-        )
+        X = moved(X, transforms[i], unit)
+        *given[names[i]], old_vertex[names[i]] = renumbered(X, T, i)
     other = analyse(given, **OF_STUDY)
     template = one["registration"].attrs["template"]
     assert other["latent"].attrs["median"] == other["registration"].attrs["template"] == template

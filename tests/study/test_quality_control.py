@@ -141,7 +141,8 @@ def test_without_quality_control_all_shapes_are_in_everything_and_findings_are_w
 
 
 def test_a_flagged_shape_is_the_template_if_given_by_name(mixed):
-    study = analyse(mixed, template="a_metre", **OPTIONS)
+    names = (*FLAGGED, "brain_03", "brain_04", "brain_05")
+    study = analyse({name: mixed[name] for name in names}, template="a_metre", **OPTIONS)
     assert study["registration"].attrs["template"] == "a_metre"
     assert left_out(study) == ["z_inch"]
     assert "a_metre, given by name, is flagged" in study["report"].attrs["remarks"]

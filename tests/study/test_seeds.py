@@ -14,8 +14,8 @@ STATISTICS = {
 
 
 @pytest.fixture(scope="module")
-def study():
-    return s4a.synthetic.example_study()
+def study(example_study):
+    return example_study
 
 
 def test_seed_and_rng_of_a_number_are_the_same_and_those_of_another_are_not():

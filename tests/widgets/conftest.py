@@ -11,6 +11,15 @@ import urllib.request
 import pytest
 
 
+@pytest.fixture(scope="session", autouse=True)
+def small_stills():
+    """Let stills of panels, which take most of the time of saving them, have few pixels."""
+    views = pytest.importorskip("s4a.widgets.views")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(views, "SIZE", (120, 96))
+        yield
+
+
 @pytest.fixture(scope="module")
 def lab(folder):
     """Start a JupyterLab and return its address."""

@@ -8,15 +8,14 @@ import pytest
 from browsing import needed
 from PIL import Image
 
-import s4a
 from s4a import widgets
 
 pytestmark = needed
 
 
 @pytest.fixture(scope="module")
-def study():
-    return s4a.synthetic.example_study()
+def study(example_study):
+    return example_study
 
 
 @pytest.fixture
