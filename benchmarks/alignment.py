@@ -33,7 +33,7 @@ import s4a
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import as_arrays
 from s4a.input.labels import read_volume
-from s4a.method.alignment import align_all, transform_onto
+from s4a.method.alignment import align_all, alignment_residual, transform_onto
 from s4a.method.shape import Shape
 from s4a.options import PRESETS
 
@@ -155,10 +155,13 @@ def ambiguous(names):
     title("collection", "shapes", "flagged", "residual", "rotated by more than 45 degrees")
     for name in names or (*CLEAN, *SYMMETRIC):
         bases = {shape: low_of(mesh).low for shape, mesh in collection(name).items()}
-        found = align_all(bases, next(iter(bases)))
+        reference, *others = bases
+        found = align_all(bases, reference)
         flagged = sum(bool(aligned.ambiguity) for aligned in found.values())
         rotated = sum(degrees(aligned.R, np.eye(3)) > 45 for aligned in found.values())
-        residual = np.median([aligned.fits[0] for aligned in found.values()])
+        residual = np.median(
+            [alignment_residual(bases[n], bases[reference], found[n].transform) for n in others]
+        )
         say(name, len(bases), flagged, f"{residual:.3f}", rotated)
 
 

@@ -24,6 +24,9 @@ NORMAL_WEIGHT = 0.2
 SIMILAR = 1.2  # ratio of the extents along two principal axes below which they can be exchanged
 DISTINCT = 45.0  # degrees between two poses
 N_POSES = 4  # poses that are compared with all samples
+# residual of a pose over that of the best, up to which it is compared with other shapes: those that
+# fit them best had at most 1.1 among 110 real shapes
+LIKELY = 1.5
 residual_of = itemgetter(2)  # the residual of an ICP result
 
 
@@ -35,6 +38,10 @@ class Cloud(NamedTuple):
     tree: cKDTree  # of the rows of all vertices
     paired: Array  # indices of the vertices paired with their nearest neighbours
     normals: Array | None = None  # (n, 3), unit normals if they are used
+
+    def thinned(self, n: int = N_ROUGH) -> "Cloud":
+        """Return the cloud with n of its paired vertices, farthest-point samples."""
+        return self._replace(paired=self.paired[farthest_points(self.X[self.paired], n)])
 
     def rows(self, i: Array | slice = slice(None), R: Array | None = None, t: Any = 0) -> Array:
         """Return positions and weighted normals of some vertices ``(p, 3 or 6)``, moved by R, t."""
@@ -368,24 +375,23 @@ def _extent_ratios(shape, center, axes):
 def poses(source: Cloud, target: Cloud) -> list[IcpResult]:
     """Return distinct transforms of the source onto the target by ICP, the best first.
 
-    ICP starts at the :func:`initial_transforms`.  If there are many, few points are paired at
-    first.
+    ICP starts at the :func:`initial_transforms`, and pairs few points at first.
     """
-    starts = initial_transforms(source, target)
-    if len(starts) > N_POSES:
-        few, fixed = (
-            c._replace(paired=c.paired[farthest_points(c.X[c.paired], N_ROUGH)])
-            for c in (source, target)
-        )
-        ends = icp_each(few, fixed, starts, tolerance=1e-3, iterations=15)
-        starts = [(R, t) for R, t, _ in distinct(ends)[:N_POSES]]
-    return distinct(icp_each(source, target, starts, tolerance=ROUGH))
+    starts, few = initial_transforms(source, target), (source.thinned(), target.thinned())
+    ends = distinct(icp_each(*few, starts, tolerance=1e-3, iterations=15))[:N_POSES]
+    return distinct(icp_each(source, target, [end[:2] for end in ends], tolerance=ROUGH))
 
 
 def distinct(ends: list[IcpResult]) -> list[IcpResult]:
-    """Sort results of ICP by residual; omit those within ``DISTINCT`` degrees of a better one."""
+    """Sort results of ICP by residual.
+
+    Those within ``DISTINCT`` degrees of a better one, and those of more than ``LIKELY`` times the
+    least residual, are omitted.
+    """
     chosen: list[IcpResult] = []
     for end in sorted(ends, key=residual_of):
+        if chosen and end[2] > LIKELY * chosen[0][2]:
+            break
         # the trace of a rotation is 1 + 2 cos(angle)
         cosines = [(np.trace(end[0].T @ other[0]) - 1) / 2 for other in chosen]
         if max(cosines, default=-1.0) < np.cos(np.deg2rad(DISTINCT)):

@@ -132,13 +132,14 @@ def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
     count : int ndarray (e,)
         Triangles at the edge: 2 in the interior of a manifold, 1 on its boundary.
     """
-    start = np.asarray(T).T.astype(np.int64).ravel()  # as in directed_edges
-    end = np.roll(start, -len(T))
-    n = max(int(start.max(initial=0)) + 1 if n is None else n, 1)
+    start = np.asarray(T).T.ravel()  # as in directed_edges
+    n = int(start.max(initial=0)) + 1 if n is None else n
     _check_numbers(start, n)
-    key = np.minimum(start, end) * n + np.maximum(start, end)
-    edge, edge_of, count = np.unique(key, return_inverse=True, return_counts=True)
-    return np.stack(np.divmod(edge, n), axis=1), edge_of, count
+    start = start.astype(np.int32 if n < 2**31 else np.int64, copy=False)  # the smaller, the faster
+    end = np.roll(start, -len(T))
+    ends = np.stack([np.maximum(start, end), np.minimum(start, end)])  # the last is the first key
+    first, edge_of = equal_rows(ends.T)
+    return ends[::-1].take(first, axis=1).T.astype(np.int64), edge_of, np.bincount(edge_of)
 
 
 def _check_numbers(key, n):
@@ -161,7 +162,7 @@ def counting_order(key: Array, n: int) -> Array:
     """
     _check_numbers(key, n)  # others would be written outside of the arrays
     m = len(key)
-    indicator = sp.csr_matrix((np.ones(m, np.int8), key, np.arange(m + 1)), (m, n))
+    indicator = sp.csr_matrix((np.empty(m, np.int8), key, np.arange(m + 1)), (m, n))
     return indicator.tocsc().indices.astype(np.int64)
 
 
@@ -229,8 +230,11 @@ def equal_rows(A: Array) -> tuple[Array, Array]:
             order = order.take(counting_order(column.take(order), int(column.max()) + 1))
     else:
         order = lexical_order(A)
-    ordered = A.take(order, axis=0)
-    new = np.r_[True, (ordered[1:] != ordered[:-1]).any(axis=1)][: len(A)]
+    new = np.zeros(len(A), bool)
+    new[:1] = True
+    for column in A.T:  # any() along an axis takes longer
+        ordered = column.take(order)
+        new[1:] |= ordered[1:] != ordered[:-1]
     group = np.empty(len(A), np.int64)
     group[order] = np.cumsum(new) - 1
     return order[new], group
@@ -238,7 +242,8 @@ def equal_rows(A: Array) -> tuple[Array, Array]:
 
 def components(pairs: Array, n: int) -> Array:
     """Return the connected component of each of n nodes linked by pairs ``(p, 2)``, from 0."""
-    links = sp.coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (n, n))
+    links = sp.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (n, n))
+    links.has_canonical_format = True  # repeated links need not be found
     return connected_components(links, directed=False)[1]
 
 

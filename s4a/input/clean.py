@@ -5,8 +5,10 @@ mate is the half-edge of the neighbour across the edge, -1 if there is none.
 """
 
 import numpy as np
+import scipy.sparse as sp
 import xarray as xr
 from numpy.typing import ArrayLike
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from s4a.geometry.mesh import (
@@ -16,7 +18,6 @@ from s4a.geometry.mesh import (
     counting_order,
     directed_edges,
     equal_rows,
-    euler_characteristic,
     n_used,
     triangle_areas,
     triangle_normals,
@@ -171,15 +172,20 @@ def clean_arrays(
     F, mate = _join_triangles(P, F, group, counts)
     V, file_vertex = _join_corners(F, mate)
     counts["split_vertices"] = len(file_vertex) - n_used(group[F])
-    X, T, file_vertex = _split_double_edges(P[file_vertex], V, file_vertex, mate, counts)
-    X, T, is_kept = _keep_components(X, T, components, counts)
+    X, T, boundary = P[file_vertex], V, directed_edges(V)[mate < 0]
+    if any(counts[kind] for kind in ("nonmanifold_edges", "cut_edges", "split_vertices")):
+        X, T, file_vertex = _split_double_edges(X, V, file_vertex, mate, counts)
+        E, _, count = unique_edges(T, len(X))
+        boundary = E[count == 1]
+    T, is_kept = _keep_components(X, T, boundary, components, counts)
     new = np.where(is_kept, np.cumsum(is_kept) - 1, -1)
-    T, file_vertex = new[T], file_vertex[is_kept]
+    X, T, file_vertex = X[is_kept], new[T], file_vertex[is_kept]
+    boundary = new[boundary[is_kept[boundary[:, 0]]]]
     if close_holes:
         X, T, nearby = fill_holes(X, T)
-        file_vertex = np.r_[file_vertex, file_vertex[nearby]]
+        file_vertex, boundary = np.r_[file_vertex, file_vertex[nearby]], boundary[:0]
         counts["closed_holes"] = len(nearby)
-    _count_topology(T, counts)
+    _count_topology(X, T, boundary, counts)
     counts["area"] = float(triangle_areas(X, T).sum())
     vertex_of_file = _vertex_of_file(group, new[V].ravel(), F.ravel())
     return X, T.astype(np.int32), file_vertex.astype(np.int32), vertex_of_file, counts
@@ -242,7 +248,7 @@ def _drop_nonfinite(P, F, strict, counts):
     which = f"{bad.sum()} of {len(P)} vertices are not finite"
     if strict and bad.any():
         raise ValueError(f"{which}; strict=False removes them")
-    F = F[~bad[F].any(axis=1)]
+    F = F[~bad[F].any(axis=1)] if bad.any() else F
     if len(F) == 0:
         raise ValueError(f"no triangle with finite vertices; {which}")
     return F
@@ -292,31 +298,34 @@ def _weld(P, F, counts):
     if not side.any():
         raise ValueError(f"a surface with area needed; all {len(F)} triangles are points")
     # the median side limits the tolerance if an outlier enlarges the bounding box
-    diagonal = np.linalg.norm(np.ptp(X, axis=0))
-    tolerance = min(_RELATIVE_TOLERANCE * diagonal, 1e-3 * np.median(side[side > 0]))
-    first, inverse = equal_rows(X)
-    label = components(_near_pairs(X[first], tolerance), len(first))
+    tolerance = _RELATIVE_TOLERANCE * np.linalg.norm(np.ptp(X, axis=0))
+    if side.min() < 1e3 * tolerance:
+        tolerance = min(tolerance, 1e-3 * np.median(side[side > 0]))
     group = np.full(len(P), -1)
-    group[used] = label[inverse]
-    counts["welded_vertices"] = int(len(used) - label.max() - 1)
+    group[used] = components(_near_pairs(X, tolerance), len(X))
+    counts["welded_vertices"] = int(len(used) - group.max() - 1)
     return group, tolerance
 
 
 def _near_pairs(X, tolerance):
-    """Pairs of points within the tolerance ``(p, 2)``."""
+    """Pairs of points within the tolerance ``(p, 2)``; each copy of a point is in one pair."""
     # candidates are within the tolerance along a line too: few, even on a voxel lattice
-    along = (X - np.median(X, axis=0)) @ (np.sqrt([1.0, 2.0, 3.0]) / np.sqrt(6))
+    along = ((X - np.median(X, axis=0)) * np.sqrt(np.arange(1, 4) / 6)).sum(1)
     order = np.argsort(along)
     close = np.diff(along[order]) <= 1.001 * tolerance  # with a margin for rounding
     near = order[np.append(close, False) | np.append(False, close)]
-    tree = cKDTree(X[near], balanced_tree=False, compact_nodes=False)
-    neighbours = tree.count_neighbors(tree, tolerance) / len(X)
+    first, copy_of = equal_rows(X[near])
+    distinct = near[first]
+    tree = cKDTree(X[distinct], balanced_tree=False, compact_nodes=False)
+    n_distinct = len(X) - len(near) + len(distinct)
+    neighbours = tree.count_neighbors(tree, tolerance) / n_distinct
     if neighbours > 100:  # the pairs would fill the memory
         raise ValueError(
             f"distinct vertices needed; each has {neighbours:.0f} others within 1e-7 of the extent "
             f"({tolerance:.1e})"
         )
-    return near[tree.query_pairs(tolerance, output_type="ndarray").astype(np.int64)]
+    pairs = distinct[tree.query_pairs(tolerance, output_type="ndarray").astype(np.int64)]
+    return np.concatenate([pairs, np.stack([near, distinct[copy_of]], axis=1)])
 
 
 def _drop_repeated(F, group, counts):
@@ -324,7 +333,8 @@ def _drop_repeated(F, group, counts):
     T = np.sort(group[F], axis=1)
     good = (T[:, 0] != T[:, 1]) & (T[:, 1] != T[:, 2])
     counts["degenerate_triangles"] = int((~good).sum())
-    F, T = F[good], T[good]
+    if not good.all():
+        F, T = F[good], T[good]
     first, inverse = equal_rows(T)
     counts["duplicate_triangles"] = len(T) - len(first)
     if len(first) == len(T):
@@ -426,17 +436,17 @@ def _heights(P, F):
     """Height of each triangle over its longest side, and first corner of that side."""
     side = _sides(P, F)
     double_area = np.linalg.norm(triangle_normals(P, F), axis=1)
-    return double_area / np.maximum(side.max(axis=1), 1e-300), side.argmax(axis=1)
+    return double_area / np.maximum(side.max(axis=0), 1e-300), side.argmax(axis=0)
 
 
 def _sides(P, F):
-    """Lengths of the sides 0-1, 1-2 and 2-0 of each triangle ``(m, 3)``."""
+    """Lengths of the sides 0-1, 1-2 and 2-0 of each triangle ``(3, m)``."""
     a, b, c = (P.take(corner, axis=0) for corner in F.T)
-    return np.stack([np.sqrt(np.einsum("ij,ij->i", v, v)) for v in (a - b, b - c, c - a)], axis=1)
+    return np.stack([np.sqrt(np.einsum("ij,ij->i", v, v)) for v in (a - b, b - c, c - a)])
 
 
-def _keep_components(X, T, wanted, counts):
-    """Keep the `wanted` components, oriented outwards; return X, T and the mask of vertices."""
+def _keep_components(X, T, boundary, wanted, counts):
+    """Keep the `wanted` components, oriented outwards; return T and the mask of vertices."""
     label = components(np.concatenate([T[:, :2], T[:, 1:]]), len(X))
     n = label.max() + 1
     area = np.bincount(label[T[:, 0]], triangle_areas(X, T), n)
@@ -455,37 +465,36 @@ def _keep_components(X, T, wanted, counts):
     counts["dropped_components"] = int(n - keep.sum())
     counts["area_dropped"] = float(area[~keep].sum() / area.sum())
     T = T[keep[label[T[:, 0]]]]
-    T, n_flipped = _orient_outwards(X, T, label, n)
+    T, n_flipped = _orient_outwards(X, T, boundary, label, n)
     counts["reoriented_triangles"] += n_flipped
-    return X[keep[label]], T, keep[label]
+    return T, keep[label]
 
 
-def _orient_outwards(X, T, label, n):
+def _orient_outwards(X, T, boundary, label, n):
     """Orient components to enclose a positive volume; return T and the number of flips.
 
     The volume is measured from the mean of the boundary vertices, or of all vertices if closed.
     """
-    E, _, count = unique_edges(T, len(X))
     weight = np.zeros(len(X))
-    weight[E[count == 1]] = 1  # on the boundary
+    weight[boundary] = 1
     closed = np.bincount(label, weight, n) == 0
     weight[closed[label]] = 1
     total = np.maximum(np.bincount(label, weight, n), 1)
     centre = np.stack([np.bincount(label, weight * x, n) / total for x in X.T], axis=1)  # (n, 3)
-    component = label[T[:, 0]]
-    a, b, c = (X.take(T[:, i], axis=0) - centre.take(component, axis=0) for i in range(3))
-    volume = np.bincount(component, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, n)
-    area = np.bincount(component, triangle_areas(X, T), n)
+    component, normal = label[T[:, 0]], triangle_normals(X, T)
+    corner = X.take(T[:, 0], axis=0) - centre.take(component, axis=0)
+    volume = np.bincount(component, np.einsum("ij,ij->i", corner, normal) / 6, n)
+    area = np.bincount(component, np.linalg.norm(normal, axis=1) / 2, n)
     inwards = volume < np.where(closed, 0, -1e-3 * area**1.5)  # a flat open patch has no outside
     flip = inwards[component]
     return np.where(flip[:, None], T[:, ::-1], T), int(flip.sum())
 
 
-def _count_topology(T, counts):
-    E, _, count = unique_edges(T)
-    boundary, ends = np.unique(E[count == 1], return_inverse=True)
-    holes = int(components(ends.reshape(-1, 2), len(boundary)).max(initial=-1) + 1)
-    chi = int(euler_characteristic(T, E))
+def _count_topology(X, T, boundary, counts):
+    """Count holes, Euler characteristic and genus of a manifold with these boundary edges."""
+    vertex, ends = np.unique(boundary, return_inverse=True)
+    holes = int(components(ends.reshape(-1, 2), len(vertex)).max(initial=-1) + 1)
+    chi = len(X) - (3 * len(T) + len(boundary)) // 2 + len(T)  # an inner edge has two triangles
     n = counts["components"] - counts["dropped_components"]
     # chi = 2 - 2 genus - holes, for each component
     counts |= {"holes": holes, "euler_characteristic": chi, "genus": (2 * n - holes - chi) // 2}
@@ -634,12 +643,12 @@ def _join_corners(F, mate):
     file_vertex : int ndarray (n,)
         The lowest row of the file of each vertex.
     """
+    # next corner around the vertex: that of the mate of the half-edge before, which ends there
     m = len(F)
-    h = np.flatnonzero(mate > np.arange(3 * m))
-    g = mate[h]
-    # the start of a half-edge is the end of its mate
-    links = np.stack([np.r_[h, (h + m) % (3 * m)], np.r_[(g + m) % (3 * m), g]], axis=1)
-    label = components(links, 3 * m)
+    following, corner = np.roll(mate, m), np.arange(3 * m)
+    links = np.where(following >= 0, following, corner), np.arange(3 * m + 1)
+    graph = sp.csr_matrix((np.ones(3 * m), *links), (3 * m, 3 * m))
+    label = connected_components(graph, directed=False)[1]
     file_vertex = np.full(label.max() + 1, np.iinfo(np.int64).max)
     np.minimum.at(file_vertex, label, F.T.ravel())
     order = counting_order(file_vertex, F.max() + 1)

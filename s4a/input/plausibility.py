@@ -49,6 +49,7 @@ _ENOUGH = 5  # shapes from which deviations are estimated
 _USUAL = 3.0  # deviations within which a shape can be a reference
 # least deviations, of logarithms; in collections that vary less every shape would be an outlier
 SIZE, COMPACTNESS, MOMENT = 0.05, 0.03, 0.05
+_CLOSE_POSE = 1.2  # residual over that of the best pose, up to which ICP goes on from a pose
 _TINY = 1e-3  # smaller distances, of identical shapes, are no evidence
 
 
@@ -310,11 +311,15 @@ def _best_pose(shape, reference):
     R, t, residual
         As of :func:`s4a.geometry.align.icp_each`.
     """
-    initial = initial_transforms(shape.cloud, reference.cloud)
-    rough = icp_each(shape.rough, reference.rough, initial, tolerance=1e-3, iterations=5, trim=TRIM)
-    best = [(R, t) for R, t, _ in sorted(rough, key=residual_of)[:2]]
-    poses = icp_each(shape.cloud, reference.cloud, best, tolerance=1e-4, iterations=30, trim=TRIM)
-    return min(poses, key=residual_of)
+    poses = initial_transforms(shape.cloud, reference.cloud)
+    rough, fine = (shape.rough, reference.rough), (shape.cloud, reference.cloud)
+    # pairs, tolerance, iterations, and how many poses are kept: more points for fewer poses
+    stages = [(rough, 1e-3, 2, 4), (rough, 1e-3, 4, 2), (fine, 1e-4, 30, 1)]
+    for clouds, tolerance, iterations, most in stages:
+        ends = icp_each(*clouds, poses, tolerance=tolerance, iterations=iterations, trim=TRIM)
+        ends = sorted(ends, key=residual_of)[:most]
+        poses = [end[:2] for end in ends if end[2] <= _CLOSE_POSE * ends[0][2]]
+    return ends[0]
 
 
 def _distances(shape, reference, pose):

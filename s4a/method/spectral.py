@@ -54,7 +54,7 @@ def eigenpairs(E: Array, w: Array, area: Array, k: int) -> tuple[Array, Array]:
     eigenvalue = np.where(np.abs(eigenvalue) < 1e-9 * max(eigenvalue[-1], 1.0), 0.0, eigenvalue)
     zero = eigenvalue == 0
     Phi[:, zero] = with_constant_first(Phi[:, zero], a)
-    Phi *= np.where(a @ Phi**3 < 0, -1.0, 1.0)
+    Phi *= np.where(a @ (Phi * Phi * Phi) < 0, -1.0, 1.0)  # a power takes 30 times as long
     if zero.any():
         Phi[:, 0] = 1.0  # exactly, so that constants stay constant in every map
     return eigenvalue, Phi

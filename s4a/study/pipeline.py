@@ -63,6 +63,7 @@ from s4a.study.tasks import (
     map_pairs,
     register_shape,
     remesh_shape,
+    voters_in,
 )
 from s4a.study.tree import open_study, stack_registration, template_mesh
 
@@ -339,6 +340,7 @@ def align(run: Run, coarse: Keys, options: Options) -> tuple[Keys, tuple[str, st
     run.do("align", [task], each=False)
     todo = [align_task(run, n, reference, options, (aligned, n)) for n in names]
     moved = {name: coarse[name] for name in run.do("align", todo)}
+    voters_in.cache_clear()  # of this process, if it aligned shapes itself
     check_usable(run, moved, options)
     return moved, (reference, coarse[reference]), aligned
 

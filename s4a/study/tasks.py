@@ -5,6 +5,7 @@ A task gets paths and names, reads the files of earlier tasks, and returns a Dat
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,17 @@ from s4a.input.collection import read_shape
 from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.landmarks import guides_of, with_landmarks
 from s4a.method import steps
-from s4a.method.alignment import align_voted, alignment_residual, less_confident, voters_of
+from s4a.method.alignment import (
+    Voters,
+    align_voted,
+    alignment_residual,
+    less_confident,
+    voters_of,
+)
 from s4a.method.latent import out_of_sample_latent
 from s4a.method.network import spectral_distance
 from s4a.method.refined_eigenfunctions import low_resolution
-from s4a.method.shape import Shape, features_of
+from s4a.method.shape import Basis, Shape, features_of
 from s4a.options import Options
 from s4a.schema import dataset, in_unit, unit_of
 from s4a.study.netcdf import open_file, read
@@ -155,13 +162,20 @@ def align_voters(folder: Path, names: list[str], reference: str, alignment: str)
     return dataset(None, rotation=R, translation=t).assign_coords(shape=list(voters))
 
 
-def align_shape(folder: Path, name: str, reference: str, alignment: str) -> xr.Dataset:
-    """Compute the rigid transform of a shape onto the reference, of unit area (4.1, step 2)."""
+@lru_cache(maxsize=1)
+def voters_in(folder: Path, reference: str, key: str) -> tuple[Basis, Voters]:
+    """Read the reference and the voters of the file with this key, as all shapes need them."""
     study = Folder(folder)
     poses = study["network/voters"]
     rows = zip(*(poses[key].values for key in ("shape", "rotation", "translation")), strict=True)
     voters = {str(n): (steps.basis_in(study, n), (R, t)) for n, R, t in rows}
-    target = steps.basis_in(study, reference)
+    return steps.basis_in(study, reference), voters
+
+
+def align_shape(folder: Path, name: str, reference: str, alignment: str) -> xr.Dataset:
+    """Compute the rigid transform of a shape onto the reference, of unit area (4.1, step 2)."""
+    study = Folder(folder)
+    target, voters = voters_in(folder, reference, study["network/voters"].attrs["task_key"])
     basis = target if name == reference else steps.basis_in(study, name)
     found = align_voted(name, basis, target, reference, alignment, voters)
     residual = alignment_residual(basis, target, found.transform)
