@@ -88,8 +88,7 @@ def nearest_float32(q: Array, d: Array) -> Array:
 def nearest_bidirectional(q: Array, d: Array) -> tuple[Array, Array]:
     """Return the nearest of d for every row of q and vice versa, from one matrix product.
 
-    The first is :func:`nearest_float32`.  For the second, the term of the distance that depends on
-    q is subtracted from each block.
+    Its entries are -|q - d|^2 / 2, with one more term than those of :func:`nearest_float32`.
 
     Examples
     --------
@@ -100,17 +99,17 @@ def nearest_bidirectional(q: Array, d: Array) -> tuple[Array, Array]:
     [[0, 1], [0, 1, 0]]
     """
     half = np.einsum("ij,ij->i", q[:, :-1], q[:, :-1]) / 2
+    q, d = np.column_stack([q, -half]), np.vstack([d, np.ones(d.shape[1], d.dtype)])
     forth, back = np.empty(len(q), np.int64), np.zeros(d.shape[1], np.int64)
     highest = np.full(d.shape[1], -np.inf, np.float32)
-    column = np.arange(d.shape[1])
     for start, score in _scores_in_blocks(q, d):
-        end = start + len(score)
-        forth[start:end] = score.argmax(axis=1)
-        score -= half[start:end, None]
-        best = score.argmax(axis=0)
-        value = score[best, column]
+        forth[start : start + len(score)] = score.argmax(axis=1)
+        value = score.max(axis=0)  # argmax takes three times as long along columns
         closer = value > highest
-        back[closer], highest[closer] = start + best[closer], value[closer]
+        np.maximum(highest, value, out=highest)
+        row, column = np.divmod(np.flatnonzero(score == value)[::-1], len(closer))
+        new = closer[column]
+        back[column[new]] = start + row[new]  # of equal rows the first, which is written last
     return forth, back
 
 
