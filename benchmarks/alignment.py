@@ -43,7 +43,7 @@ SMALL = {"n_coarse": 300, "k": 30, "n_samples": 300, "intersections": False}
 CLEAN = ("heads", "skulls", "faces", "faust_r", "kids", "hippocampi", "femurs", "femurs_sicas")
 CLEAN = (*CLEAN, "spleens", "vertebrae", "brains")
 SYMMETRIC = ("rods, bump 30 %", "rods, bump 10 %", "thin rods", "discs", "plain rods", "tori")
-ROTATED = {"hippocampi": 5, "tori": 4, "femurs_sicas": 4, "faces": 3, "heads": 2}
+ROTATED = {"hippocampi": 5, "tori": 4, "femurs_sicas": 4, "faces": 3, "heads": 3}
 
 
 def say(*cells):

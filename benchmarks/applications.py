@@ -1,12 +1,13 @@
 """What correspondences are good for.
 
-``applications.py [ellipsoids groups variance brains skulls faces heads template points parcels
-volumes]``.
+``applications.py [ellipsoids groups variance brains skulls faces heads template points
+sources parcels volumes]``.
 
 A one-mode family against the closed form, simulated groups, the variance explained at both
 resolutions (Fig. 5), transfer between two brain templates and between skulls, displacements and
 modes of faces against the published ones, a tenth head inserted into a study of nine, labels and
-landmarks of a template that is none of the collection (Fig. 6 and 7), 35 regions on remeshed
+landmarks of a template that is none of the collection (Fig. 6 and 7), landmarks of several skulls
+averaged, 35 regions on remeshed
 faces, bodies and cats by how far votes count, and 80 label volumes of hippocampi, from the files
 to modes by one command, whole and as two structures.  What is not synthetic needs the shared data
 beside the checkout.
@@ -30,7 +31,7 @@ from scipy.spatial import cKDTree
 import s4a
 import s4a_morphometrics
 from s4a import metrics, statistics, synthetic
-from s4a.analysis import permutation, transfer
+from s4a.analysis import permutation
 from s4a.geometry.align import align, cloud, farthest_points
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, vertex_areas
@@ -91,7 +92,7 @@ def brains(folder):
         "nearest vertex after ICP": labels["fsa5"][cKDTree(X @ R.T + t).query(Y)[1]],
     }
     for both in (False, True):
-        study = transfer.register_pairs(
+        study = s4a.register_pairs(
             meshes["fsa5"], {"conte69": meshes["conte69"]}, bidirectional=both
         )
         name = "S4A, matched both ways" if both else "S4A, one way"
@@ -114,7 +115,7 @@ def skulls(folder):
     point = {name: m["landmark_position"].values for name, m in marks.items()}
     error = {"nearest surface point after ICP": [], "S4A": []}
     for a, b in itertools.combinations(meshes, 2):
-        study = transfer.register_pairs(meshes[a], {b: meshes[b]}, name=a)
+        study = s4a.register_pairs(meshes[a], {b: meshes[b]}, name=a)
         for p, q in ((a, b), (b, a)):
             R, t = icp_motion(meshes[p], meshes[q])
             X, T = as_arrays(meshes[q])
@@ -324,6 +325,24 @@ def points(folder):
         )
 
 
+def sources(folder):
+    """Landmarks of each of five skulls from one other, and from all four others together."""
+    files = sorted((folder / "skulls").glob("*.ply"))
+    marks = {f.stem: read_landmarks(f.with_suffix(".mrk.json")) for f in files}
+    study = s4a.analyse({f.stem: s4a.read_shape(f) for f in files}, n_jobs=1)
+    error = {"one source": [], "four sources": []}
+    for name, mark in marks.items():
+        others = {other: one for other, one in marks.items() if other != name}
+        each = [{other: one} for other, one in others.items()]
+        for way, given in [*(("one source", one) for one in each), ("four sources", others)]:
+            found = s4a.transfer_landmarks(study, given, targets=[name])[name]
+            by_name = found.to_dataset().set_index(landmark="landmark_name")["landmark_position"]
+            found = by_name.sel(landmark=mark["landmark_name"].values).values
+            error[way].append(np.linalg.norm(found - mark["landmark_position"].values, axis=1))
+    for way, values in error.items():
+        say(f"{way}: mean {np.mean(values):.3f} mm, median {np.median(values):.3f}")
+
+
 def parcels(folder):
     """35 regions on remeshed faces, bodies and cats, by how far votes count.
 
@@ -348,7 +367,7 @@ def parcels(folder):
             corner, area = before[1][triangle], vertex_areas(X, T)
             smooth = np.einsum("spc,pc->sp", far[:, corner], weight).argmin(axis=0)
             nearest = label[np.take_along_axis(corner, weight.argmax(axis=1)[:, None], 1)[:, 0]]
-            pair = transfer.register_pairs(source, {"target": target})
+            pair = s4a.register_pairs(source, {"target": target})
             for blur, found in rows.items():
                 node = s4a.transfer_labels(pair, label, blur=blur)["target"]
                 carried = node["label"].values
@@ -497,11 +516,12 @@ def volumes():
             say(f"{name}: {n} of {len(list(files.glob('*.nii.gz')))} volumes, {took:.0f} s, {said}")
 
 
-REAL = ("brains", "skulls", "faces", "heads", "template", "points", "parcels", "volumes")
+REAL = ("brains", "skulls", "faces", "heads", "template", "points", "sources", "parcels", "volumes")
 # collections of these parts
 OF = {
     "template": ["brains"],
     "points": ["skulls"],
+    "sources": ["skulls"],
     "variance": ["faces"],
     "parcels": ["faces", "faust", "cats"],
 }

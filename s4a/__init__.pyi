@@ -13,7 +13,6 @@ from .accessor import explore as explore
 from .analysis import statistics as statistics
 from .analysis.export import write_registered as write_registered
 from .analysis.transfer import correspondence as correspondence
-from .analysis.transfer import register_pairs as register_pairs
 from .analysis.transfer import transfer_labels as transfer_labels
 from .analysis.transfer import transfer_landmarks as transfer_landmarks
 from .analysis.transfer import transfer_scalars as transfer_scalars
@@ -47,6 +46,7 @@ from .show.pictures import write_film as write_film
 from .show.pictures import write_picture as write_picture
 from .study.insert import insert as insert
 from .study.pair import match_pair as match_pair
+from .study.pair import register_pairs as register_pairs
 from .study.pipeline import analyse as analyse
 from .study.tree import open_study as open_study
 from .study.verify import verify as verify

@@ -373,16 +373,19 @@ class Options:
         more="The iteration does not change the size of the map.  Single pairs are matched by "
         ":func:`s4a.match_pair` (4.1)")
     step: int = network(8, "eigenfunctions added in each iteration of ZoomOut", least=1, paper=5,
-        section="4.2", instead="no number; 5 as in pyFM", see="method/latent", pair=True)
+        section="4.2", instead="no number; 5 as in pyFM", see="method/latent",
+        of="Consistent ZoomOut", pair=True)
     n_latent: int | None = network(None, "dimension of the latent space; by default k", least=2,
-        section="eq. 3")
+        section="eq. 3", of="Consistent ZoomOut")
     weights: str = network("cycles",
         "weights of the maps: from their mean cycle errors (cycles), as in pyFM from errors by a "
         "linear program (linear_program), or all 1 (equal)",
-        choices=("cycles", "linear_program", "equal"), section="eq. 3", see="method/network")
+        choices=("cycles", "linear_program", "equal"), section="eq. 3", see="method/network",
+        of="Consistent ZoomOut")
     isometric: bool = network(False,
         "before each latent basis of Consistent ZoomOut, replace both maps of a pair by the more "
         "orthogonal one and its transpose, as pyFM does", section="4.2", see="method/latent",
+        of="Consistent ZoomOut",
         more="The maps are then closer to area-preserving, so the energies of eq. 5 are smaller.  "
         "In pyFM this is ``isometric`` of ``FMN.zoomout_refine``, which is True by default")
     n_samples: int = network(N_SAMPLES,
@@ -393,19 +396,21 @@ class Options:
         "pose differences are small")
     dense_iterations: int = network(4,
         "final Consistent ZoomOut iterations that also search the vertices around each match",
-        paper=0, fast=0, section="eq. 3", see="method/latent",
+        paper=0, fast=0, section="eq. 3", see="method/latent", of="Consistent ZoomOut",
         more="Matches between samples alone are only as accurate as the spacing of the samples.  "
         "With ``n_samples=0`` all "
         "vertices are searched anyway")
     norm: str = network("h2",
         "norm that selects the median shape: the shape difference with the smallest norm",
         choices=("h2", "h1", "frobenius", "h2_image", "h2_both"), section="eq. 5",
+        of="Consistent ZoomOut",
         more="'frobenius' weights all eigenfunctions equally.  'h1' gives fine detail less weight, "
         "and 'h2' even less.  'h2_image' gives fine detail more weight.  'h2_both' gives fine "
         "detail less weight in the domain and more weight in the image.  "
         ":func:`s4a.method.median.distance_to_identity` has the formulas")
     keep_iterations: bool = network(False,
         "store the maps, latent bases and matches of every iteration of Consistent ZoomOut",
+        of="Consistent ZoomOut",
         more="They are the nodes of ``/iterations``.  The descriptors of initial maps are in "
         "``/network``.  :func:`s4a.match_pair` has the same option for the iterations of ZoomOut")
     template: str | None = registration(None,
@@ -435,7 +440,7 @@ class Options:
     bidirectional: bool = registration(True,
         "transfer only: match pairs in both directions and average the results",
         paper=False, section="6.2", instead="a template registered to a shape",
-        see="analysis/transfer", pair=True, more="It is an option of :func:`s4a.register_pairs`")
+        see="study/pair", pair=True, more="It is an option of :func:`s4a.register_pairs`")
     displacement_alignment: str = registration("fitted",
         "rigid alignment to the template before displacements are computed: best fit of the "
         "registered surface (fitted), or the initial alignment (initial)",
@@ -540,7 +545,9 @@ class Options:
 
         Parameters
         ----------
-        step : {"cleaning", "low resolution", "initial maps", "projection", "registration"}
+        step : str
+            "cleaning", "low resolution", "initial maps", "Consistent ZoomOut", "projection" or
+            "registration".
 
         Examples
         --------
@@ -549,10 +556,9 @@ class Options:
         {'area_weighted': True, 'n_projected': 25000}
         """
         given = {}
-        for name, one in DECLARED.items():
-            if one.metadata["of"] == step:
-                given_as = one.metadata["given_as"] or (lambda value: value)
-                given[name] = given_as(getattr(self, name))
+        for name in names_of(step):
+            given_as = DECLARED[name].metadata["given_as"] or (lambda value: value)
+            given[name] = given_as(getattr(self, name))
         return given
 
     @property
@@ -617,6 +623,11 @@ PRESETS: dict[str | None, dict[str, Any]] = {
     }
     for preset in ("paper", "fast")
 }
+
+
+def names_of(step: str) -> list[str]:
+    """Return the names of the options of a step, see :meth:`Options.of`."""
+    return [name for name, one in DECLARED.items() if one.metadata["of"] == step]
 
 
 def kept_options(study: "xr.DataTree | xr.Dataset") -> dict[str, Any]:

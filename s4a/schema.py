@@ -5,6 +5,7 @@ everywhere, and checks its input through :func:`require`.  A variable that is no
 not exist; extensions add rows by the entry points ``s4a.variables``.
 """
 
+import logging
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from s4a.extensions import extensions
 
+log = logging.getLogger(__name__)
 Array = np.ndarray  # of numbers; its dims and kind stand in the docstring
 INPUT = "unit of the input"
 POSE = "pose"  # the kind of a flag for an ambiguous pose
@@ -331,7 +333,8 @@ peak_memory | stage | MiB | peak resident memory of this process and its workers
 class Table(dict[str, tuple[tuple[str, ...], str, str]]):
     """Map the name of a variable to its dims, unit and meaning.
 
-    The rows of extensions are added when a name is looked up that the core lacks.
+    The rows of extensions are added when a name is looked up that the core lacks.  They cannot
+    change rows of the core or of each other.
     """
 
     def __init__(self, rows: Mapping[str, tuple[str, str, str]]):
@@ -342,7 +345,9 @@ class Table(dict[str, tuple[tuple[str, ...], str, str]]):
     def add(self, rows: Mapping[str, tuple[str, str, str]]) -> None:
         """Add rows, whose dims are one string."""
         for name, (dims, unit, long_name) in rows.items():
-            self.setdefault(name, (tuple(dims.split()), unit, long_name))
+            row = (tuple(dims.split()), unit, long_name)
+            if self.setdefault(name, row) != row:
+                log.warning("%s is in the table already; another row of that name is ignored", name)
 
     def __contains__(self, name: object) -> bool:
         if not super().__contains__(name) and not self.extended:
@@ -464,7 +469,10 @@ def variable(name: str, data: ArrayLike, **attrs: str | float | list[str]) -> xr
     ('vertex', 'xyz')
     """
     if name not in TABLE:
-        raise ValueError(f"no variable {name!r} in the schema; add it to s4a.schema.TABLE first")
+        raise ValueError(
+            f"no variable {name!r} in the schema; add a row to s4a.schema.ROWS, or to the entry "
+            "point s4a.variables of an extension"
+        )
     dims, unit, long_name = TABLE[name]
     data = np.asarray(data)
     if data.ndim == len(dims) - 1 and dims[0] in OMITTED:

@@ -190,6 +190,7 @@ def complete(
     samples: int = 10,
     components: int | str | None = None,
     seed: int,
+    **system: Any,
 ) -> int:
     """Match a part of a shape to a finished study, and estimate the whole shape.
 
@@ -216,7 +217,7 @@ def complete(
         "components": components,
         "n_samples": samples,
     }
-    found = m.complete(s4a.open_study(study), part, seed=seed, **options)
+    found = m.complete(s4a.open_study(study), part, seed=seed, **options, **system)
     paths = m.write_completed(found, out)
     write("\n".join(words.completed_lines(found)))
     write(f"\nwritten: {', '.join(map(str, paths[:2]))}, samples: {len(paths) - 2}")
@@ -273,5 +274,5 @@ def export(
 ASYMMETRY = command(asymmetry, ("seed",))
 GROWTH = command(growth, ("seed",))
 COVARIATION = command(covariation, ("seed",))
-COMPLETE = command(complete, ("seed",))
+COMPLETE = command(complete, ("seed", *SYSTEM))
 EXPORT = command(export, SYSTEM)

@@ -17,6 +17,7 @@ from s4a.analysis.export import write_dataset
 from s4a.analysis.inputs import registration_of
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
+from s4a.input.coordinates import CoordinateSystem, in_one_system
 from s4a.input.files import write_mesh
 from s4a.input.landmarks import with_landmarks
 from s4a.input.raw import shown
@@ -58,6 +59,8 @@ def complete(
     *,
     landmarks: Path | str | None = None,
     components: str | int | None = None,
+    coordinate_system: str | None = None,
+    unit: str | None = None,
     n_samples: int = 10,
     seed: int = 0,
     rng: RNG | None = None,
@@ -83,6 +86,8 @@ def complete(
         Landmarks of the mesh.  Three or more with names of the template's landmarks fix the pose.
     components : "largest" or int, optional
         Connected components to keep, see :func:`s4a.clean`; by default as in the study.
+    coordinate_system, unit : str, optional
+        Of a part or landmarks that state none, see :mod:`s4a.input.coordinates`.
     n_samples : int
         Number of random shapes from the distribution.
     seed, rng : see :mod:`s4a.seeds`
@@ -91,7 +96,7 @@ def complete(
     -------
     Dataset
         A mesh with the template's triangles: ``position(vertex, xyz)`` in the pose of the file,
-        ``present(vertex)``, ``completion_sd(vertex, xyz)`` along the axes of the file and
+        in the axes and unit of the study; ``present(vertex)``, ``completion_sd(vertex, xyz)`` and
         ``completion_normal_sd(vertex)``, ``sample_position(sample, vertex, xyz)``;
         ``score(component)``, ``score_covariance(component, component_2)``; and, as in
         ``/registration``, ``displacement``, ``rotation``, ``translation`` and ``scale``.
@@ -106,7 +111,8 @@ def complete(
     Raises
     ------
     ValueError
-        If the study has no modes, or the mesh cannot be read, has less than 15 % of the template or
+        If the study has no modes, or the mesh cannot be read, is in an unknown coordinate system
+        although that of the study is known, has less than 15 % of the template or
         does not fit the shapes.
 
     See Also
@@ -141,7 +147,8 @@ def complete(
     """
     check_count("n_samples", n_samples)
     model = model_of(study)
-    mesh = read_part(study, part, components, landmarks)
+    system = {"coordinate_system": coordinate_system, "unit": unit}
+    mesh = read_part(study, part, landmarks, components=components, **system)
     partial = part_of(*as_arrays(mesh))
     usual = usual_pose(study, model)
     fit, whole = fit_part(partial, model, usual, mesh)
@@ -160,6 +167,7 @@ def complete(
     result = completed(model, partial, fit, known, low, n_samples, generator)
     template = model.template.original
     result = in_unit(result, common_unit(template, mesh))
+    result.attrs |= CoordinateSystem.of(mesh.attrs).attrs
     result.attrs["template"] = study["registration"].attrs["template"]
     result.attrs["warning"] = "; ".join(warnings_of(result))
     if result.attrs["warning"]:
@@ -170,12 +178,12 @@ def complete(
 def read_part(
     study: xr.DataTree,
     part: Path | str | tuple[Any, Any] | xr.Dataset,
-    components: str | int | None = None,
     landmarks: Path | str | None = None,
+    **given: Any,
 ) -> xr.Dataset:
-    """Read and clean a partial shape; its holes stay open."""
-    given = {"close_holes": False} | ({} if components is None else {"components": components})
-    options = Options.from_report(study).changed(given)
+    """Read and clean a partial shape, in the axes and unit of the study; its holes stay open."""
+    given = {name: value for name, value in given.items() if value is not None}
+    options = Options.from_report(study).changed({"close_holes": False} | given)
     if isinstance(part, str | Path) and not Path(part).exists():
         raise ValueError(f"{shown(part)}: no such file")
     meshes, attrs = read_new(part if isinstance(part, str | Path) else {"part": part}, options)
@@ -186,7 +194,11 @@ def read_part(
             f"{', '.join(meshes)}{'; '.join(reasons)}"
         )
     (mesh,) = meshes.values()
-    return mesh if landmarks is None else with_landmarks(mesh, landmarks)
+    if landmarks is not None:
+        given.pop("components", None)
+        mesh = with_landmarks(mesh, landmarks, **given)
+    template = study["original"][study["registration"].attrs["template"]].to_dataset()
+    return in_one_system({"template": template, "part": mesh})["part"]
 
 
 def usual_pose(study: xr.DataTree, model: Model) -> Pose:
@@ -392,17 +404,18 @@ def write_completed(found: xr.Dataset, folder: Path | str) -> list[Path]:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_dataset(found, folder / "completed.nc")
-    triangles = found["corner_vertex"].values
+    triangles, system = found["corner_vertex"].values, CoordinateSystem.of(found.attrs).attrs
     deviation = np.sqrt((found["completion_sd"].values ** 2).sum(1))
     write_mesh(
         folder / "completed.ply",
         found["position"].values,
         triangles,
+        **system,
         present=found["present"].values.astype(float),
         deviation=deviation,
     )
     paths = [folder / "completed.nc", folder / "completed.ply"]
     for i, position in enumerate(found["sample_position"].values):
         paths.append(folder / f"sample_{i:02d}.ply")
-        write_mesh(paths[-1], position, triangles)
+        write_mesh(paths[-1], position, triangles, **system)
     return paths

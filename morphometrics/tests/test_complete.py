@@ -6,14 +6,14 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from s4a import analyse, cli, insert, synthetic, with_landmarks, write_mesh
-from s4a.geometry.mesh import as_arrays, vertex_areas
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a_morphometrics import calibration, complete, posterior
 from s4a_morphometrics.calibration import (
     between_paths,
     deviation_of,
     path_differences,
 )
-from s4a_morphometrics.completion import warnings_of
+from s4a_morphometrics.completion import read_part, warnings_of
 from s4a_morphometrics.part import cut
 from s4a_morphometrics.partial import model_of
 
@@ -255,6 +255,16 @@ def test_landmarks_determine_the_pose_of_a_part(tree, brain, part, tmp_path):
     assert found.attrs["missing"] == pytest.approx(0.3, abs=0.1)
 
 
+def test_a_part_is_converted_to_the_coordinate_system_of_the_study(study, brain):
+    study, ras = study.copy(), {"coordinate_system": "RAS", "unit": "mm"}
+    study["original"][study["registration"].attrs["template"]].attrs |= ras
+    X, T = as_arrays(brain)
+    las = as_dataset(X * [-1, 1, 1], T[:, ::-1], {"coordinate_system": "LAS", "unit": "mm"})
+    assert read_part(study, las)["position"].values == pytest.approx(X)
+    with pytest.raises(ValueError, match="convertible coordinate systems needed"):
+        read_part(study, las.assign_attrs(unit=""))
+
+
 def test_invalid_parts_are_refused_with_the_reason(study, brain, tmp_path):
     X, T = as_arrays(brain)
     small = cut(X, T, X[:, 1] > np.quantile(X[:, 1], 0.93))
@@ -285,6 +295,8 @@ def test_the_command_writes_the_completed_mesh(study_folder, meshes, tmp_path, c
     write_mesh(file, *part_of(meshes["brain_02"]))
     out = tmp_path / "out"
     words = ["complete", str(study_folder), str(file), "--out", str(out), "--samples", "1"]
+    assert cli.main(words) == 2  # the study is in RAS, the part in an unknown system
+    words += ["--coordinate-system", "RAS", "--unit", "mm"]
     assert cli.main(words) == 0
     said = capsys.readouterr().out
     assert "% of the template" in said

@@ -9,6 +9,9 @@ import tomllib
 import pytest
 from paths import DOCS
 
+from s4a.extensions import GROUPS, extensions
+from s4a.schema import Table
+
 CODE = """
 import s4a
 from s4a.cli import main
@@ -22,6 +25,11 @@ try:
 except SystemExit:
     pass
 """
+
+WRONG = {
+    "__init__": "SIZE = print\nROWS = {'size': ('shape', 'mm')}\n",
+    "panel": "def Size(study):\n    return study\n",
+}
 
 
 @pytest.fixture
@@ -70,9 +78,28 @@ def test_the_extension_of_the_page_has_its_command_its_tab_and_its_variable(
     assert head == "shape,centroid_size"
 
 
+def test_a_row_of_another_extension_is_not_replaced_and_a_warning_names_it(caplog):
+    table = Table({"size": ("shape", "1", "a size")})
+    table.add({"size": ("shape", "mm", "another size"), "area": ("", "mm2", "an area")})
+    assert table["size"] == (("shape",), "1", "a size")
+    assert "size is in the table already" in caplog.text
+    assert "area" in table
+
+
+def test_an_extension_with_other_objects_is_named_and_left_out(extension, monkeypatch, caplog):
+    for name, text in WRONG.items():
+        (extension / "s4a_size" / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(extension)
+    found = {group: extensions.__wrapped__(group) for group in GROUPS}
+    sys.modules.pop("s4a_size.panel"), sys.modules.pop("s4a_size")
+    assert all("size" not in map(str.lower, objects) for objects in found.values())
+    for what, _ in GROUPS.values():
+        assert f"of s4a-size cannot be used, and is left out: {what} expected, found" in caplog.text
+
+
 def test_an_extension_that_cannot_be_imported_is_named_and_left_out(extension):
     (extension / "s4a_size" / "__init__.py").write_text("import nothing_of_that_name\n")
     done = run(extension, "import sys\nfrom s4a.cli import main\nsys.exit(main(['--help']))")
     assert done.returncode == 0
-    assert "size of s4a-size cannot be imported, and is left out" in done.stderr
+    assert "size of s4a-size cannot be used, and is left out" in done.stderr
     assert "statistics" in done.stdout

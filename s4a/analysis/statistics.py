@@ -4,17 +4,6 @@ All functions take a study and return a Dataset.  Functions of plain arrays are 
 :mod:`s4a.analysis.permutation` and :mod:`s4a.analysis.model`; groups and variables are in
 :mod:`s4a.analysis.effects`.  Asymmetry, growth, fields, regions and generalization with new
 correspondences are in the extension ``s4a_morphometrics``.
-
-To add a statistic:
-
-1. get its data by ``sample_of(study, values, "group", covariates)``, which accepts arrays, dicts
-   and columns of ``/subjects``, and returns the displacements ``d (shape, vertex, xyz)`` of the
-   shapes with all values, the vertex areas and the columns of the covariates; without values, by
-   ``displacements_of(study)`` (:mod:`s4a.analysis.inputs`);
-2. write its arithmetic as a function of plain arrays, tested on a known answer;
-3. add its variables to :data:`s4a.schema.TABLE`; return ``in_unit(dataset(...), unit)``;
-4. add its name to ``__all__`` below, its command to :mod:`s4a.cli.commands`;
-5. test it on data with a simulated effect and under the null hypothesis.
 """
 
 from typing import TYPE_CHECKING

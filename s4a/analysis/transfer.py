@@ -19,9 +19,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 import xarray as xr
-from joblib import delayed
 from scipy.sparse.linalg import cg
-from threadpoolctl import threadpool_limits
 
 from s4a.analysis.inputs import all_registered
 from s4a.geometry.closest import (
@@ -31,17 +29,14 @@ from s4a.geometry.closest import (
     interpolation_matrix,
 )
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas, vertex_normals
-from s4a.input.collection import Mesh, as_meshes
-from s4a.input.coordinates import CoordinateSystem
+from s4a.input.coordinates import CoordinateSystem, in_one_system
 from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, as_landmarks, locate, trace_curves
 from s4a.method.register import common_unit, identity, uncertainty
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
-from s4a.schema import check_type, dataset, in_unit, require
-from s4a.study.pair import log_warning, match_shapes, shape_of
-from s4a.study.processes import workers
-from s4a.study.tree import stack_registration, template_mesh
+from s4a.schema import dataset, in_unit, require
+from s4a.study.pair import log_warning, match_both, shape_of
 
 BLURS = {None: 1.0, "fast": 1.0, "paper": 0.0}  # default of `blur` by preset
 
@@ -215,133 +210,6 @@ def majority(vote: np.ndarray, value: np.ndarray) -> np.ndarray:
     return value[vote.round(6).argmax(1)]  # votes within six digits are ties
 
 
-def pair_study(result: xr.Dataset, source: xr.Dataset, target: xr.Dataset) -> xr.DataTree:
-    """Convert a result of :func:`s4a.match_pair` to a study, with the target as template.
-
-    Parameters
-    ----------
-    result, source, target : Dataset
-        The result, and the two meshes.
-
-    Returns
-    -------
-    DataTree
-        ``/original``, ``/registration``, for the functions of this module.
-    """
-    registered = result.rename(match="registered_match")
-    return _study_of("target", target, {"source": source}, {"source": registered}, {})
-
-
-def _study_of(name, template, shapes, forth, back):
-    """Registered study; `forth` are registrations of the shapes, `back` of the template."""
-    meshes = {name: template, **shapes}
-    nodes = {f"original/{n}": mesh for n, mesh in meshes.items()}
-    files = {name: identity(Shape(template)), **forth}
-    nodes |= stack_registration(template_mesh(template, name), files, list(meshes))
-    return xr.DataTree.from_dict(nodes | {f"reverse/{n}": data for n, data in back.items()})
-
-
-def _shape_of(mesh, options):
-    """Shape of a mesh, with low resolution and spectrum."""
-    with threadpool_limits(1):
-        return shape_of(mesh, options)
-
-
-def _match_both(shape, template, options):
-    """Register the shape to the template and, with `bidirectional`, the template to the shape."""
-    with threadpool_limits(1):
-        forth = match_shapes(shape, template, options)[0]
-        return forth, match_shapes(template, shape, options)[0] if options.bidirectional else None
-
-
-def register_pairs(
-    template: Mesh,
-    shapes: dict[str, Mesh],
-    *,
-    name: str = "template",
-    n_jobs: int | None = None,
-    preset: str | None = None,
-    **options: Any,
-) -> xr.DataTree:
-    """Register a template to each shape without a network (6.2), for transfer.
-
-    Parameters
-    ----------
-    template : path or Dataset
-        Mesh file, or clean mesh, such as :func:`s4a.read_shape` returns.
-    shapes : dict of str to path or Dataset
-        Name -> mesh file, or clean mesh.
-    name : str
-        Name of the template.
-    n_jobs : int, optional
-        Number of parallel processes, as in joblib: -1 for all cores, None for one.  The result does
-        not depend on it.
-    preset : {None, "paper", "fast"}
-        Presets of :func:`s4a.match_pair`.  ``"paper"`` also sets bidirectional=False, and blur=0 in
-        :func:`s4a.transfer_labels`.
-    **options
-        Options of :func:`s4a.match_pair`, and ``bidirectional``.  By default, each pair is matched
-        in both directions, and a transfer averages both.  :class:`s4a.Options` describes them.
-
-    Returns
-    -------
-    DataTree
-        A study with the nodes
-
-        - ``/original``: meshes of the template and of the shapes;
-        - ``/registration``: registration of each shape to the template; the attributes ``status``
-          and ``warning`` of ``/registration/NAME`` flag registrations that are probably wrong, as
-          in :func:`s4a.match_pair`;
-        - ``/reverse``: registration of the template to each shape, with `bidirectional`.
-
-    Raises
-    ------
-    ValueError
-        If a shape has the name of the template, a mesh lacks a variable, or an option is out of
-        range or contradicts the preset.
-
-    See Also
-    --------
-    s4a.match_pair : Match one pair.
-    s4a.analyse : Register a collection by a network.
-    s4a.transfer_labels, s4a.transfer_scalars, s4a.transfer_landmarks : Use the registrations.
-
-    Examples
-    --------
-    >>> import s4a
-    >>> brains = s4a.synthetic.brains(6, 200)
-    >>> source = brains["original/brain_01"].to_dataset()
-    >>> target = brains["original/brain_02"].to_dataset()
-    >>> pairs = s4a.register_pairs(source, {"brain_02": target}, n_coarse=100, k_init=6, k=10)
-    >>> s4a.transfer_labels(pairs, source["label"].values)["brain_02"]["label"].sizes["vertex"]
-    200
-    """
-    check_type(shapes, dict, "shapes")
-    if name in shapes or not shapes:
-        raise ValueError(
-            f"shapes other than the template {name!r} are needed; found "
-            f"{', '.join(shapes) or 'none'}"
-        )
-    settings = given_options({"preset": preset, **options}, pair=True)
-    meshes = as_meshes({name: template, **shapes}, settings)
-    parallel = workers(n_jobs)
-    inside, *others = parallel(delayed(_shape_of)(mesh, settings) for mesh in meshes.values())
-    pairs = parallel(delayed(_match_both)(shape, inside, settings) for shape in others)
-    forth = {n: pair[0] for n, pair in zip(shapes, pairs, strict=True)}
-    back = (
-        {n: pair[1] for n, pair in zip(shapes, pairs, strict=True)}
-        if settings.bidirectional
-        else {}
-    )
-    for n, registration in forth.items():
-        log_warning(registration, n)
-        if n in back:
-            log_warning(back[n], f"{n} in reverse")
-    study = _study_of(name, meshes.pop(name), meshes, forth, back)
-    study["registration"].attrs["preset"] = settings.preset or ""
-    return study
-
-
 def _preset(study: xr.DataTree, given: dict[str, Any]) -> str | None:
     """Preset of a transfer: the given one, else that of the study or of its pairs."""
     if "preset" in given:
@@ -391,9 +259,9 @@ def _routes_from_outside(
             template, study["coarse"][name].to_dataset().load(), **options.of("projection")
         )
     else:
-        inside = _shape_of(template, options)
-    outside = _shape_of(mesh, options)
-    forth, back = _match_both(inside, outside, options)
+        inside = shape_of(template, options)
+    outside = shape_of(mesh, options)
+    forth, back = match_both(inside, outside, options)
     log_warning(forth, f"the registration of {name!r} to the external source")
     routes: list[Route] = [[(link(mesh, template, forth), "down")]]
     if back is not None:
@@ -438,7 +306,9 @@ def plan(
         )
     if isinstance(source, xr.Dataset):
         require(source, "position", "corner_vertex", what="source")
-        mesh, up = source, _routes_from_outside(study, source, options or {})
+        both = {"template": study["original"][template].to_dataset(), "source": source}
+        mesh = in_one_system(both)["source"]
+        up = _routes_from_outside(study, mesh, options or {})
     elif options:
         raise ValueError(
             f"options {', '.join(options)} need an external source, which is matched to the "
@@ -455,9 +325,41 @@ def plan(
     return mesh, routes_to_targets()
 
 
+def plan_several(
+    study: xr.DataTree,
+    given: Any,
+    source: str | xr.Dataset | None,
+    targets: list[str] | None,
+    options: dict[str, Any],
+) -> tuple[list[tuple[xr.Dataset, Any]], Iterator[tuple[str, xr.Dataset, list[list[Route]]]]]:
+    """Return (mesh, values) of every source, and an iterator of (target, mesh, routes by source).
+
+    `given` are the values of one `source`, or a dict of names of sources to their values.
+    """
+    several = isinstance(given, dict)
+    if several and (source is not None or not given):
+        raise ValueError(
+            f"a dict of sources to their values replaces source=; found {len(given)} sources and "
+            f"source={source if isinstance(source, str) or source is None else 'a mesh'!r}"
+        )
+    sources = list(given.items()) if several else [(source, given)]
+    if several and targets is None:
+        names = all_registered(study)["shape"].values.tolist()
+        targets = [name for name in names if name not in given]
+    plans = [plan(study, name, targets, options) for name, _ in sources]
+
+    def routes_to_targets():
+        for steps in zip(*(steps for _, steps in plans), strict=True):
+            name, target, _ = steps[0]
+            yield name, target, [routes for *_, routes in steps]
+
+    meshes = [mesh for mesh, _ in plans]
+    return list(zip(meshes, (values for _, values in sources), strict=True)), routes_to_targets()
+
+
 def transfer_labels(
     study: xr.DataTree,
-    label: np.ndarray,
+    label: Any,
     *,
     source: str | xr.Dataset | None = None,
     targets: list[str] | None = None,
@@ -465,20 +367,22 @@ def transfer_labels(
     blur: float | None = None,
     **options: Any,
 ) -> xr.DataTree:
-    """Transfer labels of one mesh to every shape of a registered study (6.2, Fig. 6).
+    """Transfer labels of one or several meshes to every shape of a study (6.2, Fig. 6).
 
     Parameters
     ----------
     study : DataTree
-        A finished study, or a result of :func:`register_pairs` or :func:`pair_study`.
-    label : array_like (vertex,)
+        A finished study, or a result of :func:`s4a.register_pairs` or
+        :func:`s4a.study.pair.pair_study`.
+    label : array_like (vertex,), or dict of str to array_like
         Numbers or names at the vertices of the source in ``/original`` (see
-        :func:`s4a.input.annotations.labels_of_mesh`).
+        :func:`s4a.input.annotations.labels_of_mesh`); or a dict of several sources to their labels,
+        which have equal votes.
     source : str or Dataset, optional
         Name of a shape of the study, by default the template; or an external mesh.  An external
         mesh is first matched to the template with the options of the study.
     targets : list of str, optional
-        Names of the shapes that receive the labels; by default all other shapes.
+        Names of the shapes that receive the labels; by default all that are not a source.
     votes : bool
         Also return the share of the votes for every label.
     blur : float, optional
@@ -488,7 +392,7 @@ def transfer_labels(
         paper, disables diffusion.  The default is 1, or 0 with ``preset="paper"`` of the study or
         of an external source.
     **options
-        Options of :func:`register_pairs` for an external source, including ``preset``.  They
+        Options of :func:`s4a.register_pairs` for an external source, including ``preset``.  They
         replace the options of the study.
 
     Returns
@@ -544,15 +448,18 @@ def transfer_labels(
     """
     if blur is not None and not 0 <= blur <= 10:
         raise ValueError(f"blur needs a factor from 0 to 10; found {blur}")
-    mesh, routes_to_targets = plan(study, source, targets, options)
+    sources, routes_to_targets = plan_several(study, label, source, targets, options)
     blur = BLURS[_preset(study, options)] if blur is None else blur
-    label = _per_vertex(label, mesh, "label")
+    labels = [_per_vertex(values, mesh, "label") for mesh, values in sources]
     transferred = {}
     for name, target, routes in routes_to_targets:
-        W, confidence = blend_routes(routes, len(label))
-        vote, value = votes_of(W, label)
+        blended = [blend_routes(r, len(one)) for r, one in zip(routes, labels, strict=True)]
+        W = sp.hstack([W for W, _ in blended]).tocsr() / len(blended)
+        confidence = np.mean([confidence for _, confidence in blended], axis=0)
+        vote, value = votes_of(W, np.concatenate(labels))
         winner = majority(vote, value)
-        if blur and any(routes):  # the source itself has an empty route, without uncertainty
+        # the source itself has an empty route, without uncertainty
+        if blur and any(map(any, routes)):
             vote = diffuse_votes(vote, *as_arrays(target), blur * uncertainty(confidence))
             diffused = majority(vote, value)
             lost = np.setdiff1d(winner, diffused)
@@ -649,14 +556,14 @@ def _per_vertex(values, mesh, what):
 
 def transfer_landmarks(
     study: xr.DataTree,
-    landmarks: xr.Dataset | Path | str,
+    landmarks: xr.Dataset | Path | str | dict[str, xr.Dataset | Path | str],
     *,
     source: str | xr.Dataset | None = None,
     targets: list[str] | None = None,
     farthest: float = FARTHEST_LANDMARK,
     **options: Any,
 ) -> xr.DataTree:
-    """Transfer landmarks of one mesh to every shape of a registered study (6.2, Fig. 7).
+    """Transfer landmarks of one or several meshes to every shape of a study (6.2, Fig. 7).
 
     Curves of landmarks (``landmark_curve``, see :func:`s4a.input.annotations.read_landmarks`) are
     sampled along the surface of the source at the mean edge length, and become polylines.
@@ -666,8 +573,9 @@ def transfer_landmarks(
     study, source, targets, **options
         As in :func:`transfer_labels`: the study, the shape that the landmarks belong to, the shapes
         that receive them, and options for an external source.
-    landmarks : path or Dataset
-        A landmark file, or a result of :func:`s4a.input.annotations.read_landmarks`.
+    landmarks : path or Dataset, or dict of str to path or Dataset
+        A landmark file, or a result of :func:`s4a.input.annotations.read_landmarks`; or a dict of
+        several sources to theirs, with the same names.  Their images are averaged.
     farthest : float
         Largest valid distance of a landmark from the surface of the source, as a share of
         sqrt(area).
@@ -685,8 +593,8 @@ def transfer_landmarks(
         - ``landmark_confidence(landmark)``: confidence of the match, from 0 to 1.  It finds failed
           regions of shapes in different poses; among shapes in similar poses it is an average of
           the group and does not rank the points by their error;
-        - ``landmark_disagreement(landmark)``, if several matches are averaged: largest distance of
-          one of their results from the mean;
+        - ``landmark_disagreement(landmark)``, if several sources or matches are averaged: largest
+          distance of one of their results from the mean;
         - ``landmark_curve`` and ``landmark_closed``, with curves: name of the curve of each point,
           and True if the curve is closed.
 
@@ -726,17 +634,34 @@ def transfer_landmarks(
     >>> s4a.show.charts.surfaces(shown, colors)
     <TiledFigure ...>
     """
-    mesh, routes_to_targets = plan(study, source, targets, options)
-    landmarks = as_landmarks(landmarks)
-    marked = locate(landmarks, mesh, farthest=farthest)
-    if "landmark_curve" in landmarks:
-        marked = trace_curves(marked, mesh)
-    named = marked[[name for name in NAMED if name in marked]]
+    sources, routes_to_targets = plan_several(study, landmarks, source, targets, options)
+    marked = [_located(marks, mesh, farthest) for mesh, marks in sources]
+    marked = [marked[0], *(_in_order_of(marked[0], one) for one in marked[1:])]
+    named = marked[0][[name for name in NAMED if name in marked[0]]]
     transferred = {}
     for name, target, routes in routes_to_targets:
         image = _transfer_landmarks(marked, target, routes).merge(named)
         transferred[name] = image.assign_attrs(CoordinateSystem.of(target.attrs).attrs)
     return xr.DataTree.from_dict(transferred)
+
+
+def _located(landmarks, mesh, farthest):
+    """Landmarks and points along curves on the surface of a mesh."""
+    landmarks = as_landmarks(landmarks)
+    marked = locate(landmarks, mesh, farthest=farthest)
+    return trace_curves(marked, mesh) if "landmark_curve" in landmarks else marked
+
+
+def _in_order_of(first, marked):
+    """Landmarks in the order of the names of the first source; they must be the same."""
+    names, others = (one["landmark_name"].values.astype(str).tolist() for one in (first, marked))
+    if sorted(names) != sorted(others) or len(set(names)) < len(names):
+        wrong = sorted(set(names) ^ set(others)) or "names that occur twice"
+        raise ValueError(
+            f"several sources need the same landmarks with different names, and no curves; "
+            f"found in some only: {wrong}"
+        )
+    return marked.isel(landmark=[others.index(name) for name in names])
 
 
 def correspondence(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
@@ -749,7 +674,8 @@ def correspondence(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
     Parameters
     ----------
     study : DataTree
-        A finished study, or a result of :func:`register_pairs` or :func:`pair_study`.
+        A finished study, or a result of :func:`s4a.register_pairs` or
+        :func:`s4a.study.pair.pair_study`.
     source, target : str
         Names of two shapes of the study; either may be the template.
 
@@ -785,7 +711,8 @@ def correspondence(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
     _, shape, routes = next(routes_to_targets)
     vertices = identity(Shape(mesh))
     points = vertices["template_triangle"].values, vertices["template_barycentric"].values
-    position, (triangle, weights), confidence, _ = _blend_points(points, shape, routes)
+    paths = [(points, route) for route in routes]
+    position, (triangle, weights), confidence, _ = _blend_points(paths, shape)
     image = dataset(
         image_triangle=triangle.astype(np.int32),
         image_barycentric=weights,
@@ -796,9 +723,13 @@ def correspondence(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
 
 
 def _transfer_landmarks(marked, target, routes):
-    """Mean of the landmarks of all routes, weighted by confidence, on the surface."""
-    points = marked["landmark_triangle"].values, marked["landmark_barycentric"].values
-    position, (triangle, weights), confidence, distance = _blend_points(points, target, routes)
+    """Mean of the landmarks of all sources and routes, weighted by confidence, on the surface."""
+    paths = [
+        ((one["landmark_triangle"].values, one["landmark_barycentric"].values), route)
+        for one, of_source in zip(marked, routes, strict=True)
+        for route in of_source
+    ]
+    position, (triangle, weights), confidence, distance = _blend_points(paths, target)
     disagreement = {} if distance is None else {"landmark_disagreement": distance}
     return dataset(
         landmark_position=position,
@@ -809,14 +740,14 @@ def _transfer_landmarks(marked, target, routes):
     )
 
 
-def _blend_points(points, target, routes):
-    """Mean of points along all routes, weighted by confidence, on the surface of the target.
+def _blend_points(paths, target):
+    """Mean of points, each along its route, weighted by confidence, on the surface of the target.
 
     Position ``(p, 3)``, triangle and weights, confidences ``(routes, p)``, and the largest distance
     of a route from the mean ``(p,)``, None for one route.
     """
     X, T = as_arrays(target)
-    results = [transfer_along(route, *points) for route in routes]
+    results = [transfer_along(route, *points) for points, route in paths]
     confidence = np.stack([result[2] for result in results])  # (routes, p)
     on_surface = results[0][:2]
     distance = None

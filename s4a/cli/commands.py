@@ -22,7 +22,7 @@ import s4a
 from s4a.cli import tables
 from s4a.cli.doctor import examine, lines
 from s4a.cli.flags import ALL_OPTIONS, command
-from s4a.options import DECLARED, N_COARSE, Options
+from s4a.options import DECLARED, N_COARSE, Options, names_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,8 +39,12 @@ def check(paths: list[str], **options: Any) -> int:
     paths : PATH
         folders, globs or mesh files
     """
-    report = s4a.read_shapes(paths, **options)["report"].to_dataset()
+    from s4a.input.coordinates import CoordinateSystem, common
+
+    shapes = s4a.read_shapes(paths, **options)
+    report = shapes["report"].to_dataset()
     write(*tables.decision_lines(report), tables.report_table(report))
+    common({name: CoordinateSystem.of(mesh.attrs) for name, mesh in shapes["original"].items()})
     return 0 if (report["status"] != "excluded").all() else 1
 
 
@@ -693,10 +697,9 @@ def write(*texts: str) -> None:
 
 OF_PAIRS = [name for name, one in DECLARED.items() if one.metadata["pair"]]
 SYSTEM = ("coordinate_system", "unit")
-CLEANING = ("components", "pattern", "label", "strict", "close_holes", "intersections", *SYSTEM)
 COMMANDS = {
     "doctor": command(doctor),
-    "check": command(check, CLEANING),
+    "check": command(check, ("pattern", *names_of("cleaning"), "intersections")),
     "run": command(run, ALL_OPTIONS),
     "verify": command(verify),
     "status": command(status),

@@ -58,6 +58,11 @@ def command(
     unset : bool
         Whether options that are not given are None.
 
+    Raises
+    ------
+    ValueError
+        If an option is unknown.
+
     Examples
     --------
     >>> from s4a.cli.flags import command
@@ -77,7 +82,9 @@ def command(
     text, _, examples = (inspect.getdoc(function) or "").partition("\n\nExamples\n--------\n")
     summary, _, rest = text.partition("\n\nParameters\n----------\n")
     documented = {name: (value, about) for name, value, about in PARAMETER.findall(f"{rest}\n")}
-    parameters = inspect.signature(function).parameters.values()
+    parameters = inspect.signature(function, eval_str=True).parameters.values()
+    if unknown := set(options) - set(ALL_OPTIONS):
+        raise ValueError(f"options of s4a.Options, or n_jobs, expected; found {sorted(unknown)}")
     own = [p for p in parameters if p.kind is not p.VAR_KEYWORD and p.name not in options]
 
     def run(args: argparse.Namespace) -> int:

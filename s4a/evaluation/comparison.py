@@ -33,6 +33,7 @@ from s4a.evaluation.methods import (
 from s4a.geometry.align import relative_transform
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.collection import Mesh, as_mesh, read_shapes
+from s4a.input.coordinates import in_one_system
 from s4a.input.landmarks import locate
 from s4a.input.raw import content, npy, shown, text_of
 from s4a.method import latent, median, network
@@ -265,6 +266,7 @@ def compare(
         M = Spaces(mesh, n_coarse, k, seed)
         for name, shape in tqdm(target.items(), desc="pairs", disable=len(target) < 2):
             mesh, load_target = load_mesh(shape, f"target {name}")
+            mesh = in_one_system({"source": M.mesh, "target": mesh})["target"]
             N = Spaces(mesh, n_coarse, k, seed)
             marks = None if landmarks is None else landmarks_of(landmarks[name], M, N, in_memory)
             true = None if truth is None else truth[name]
@@ -486,7 +488,8 @@ def compare_collection(
     begin = time.process_time()
     tree = shapes if isinstance(shapes, xr.DataTree) else read_shapes(shapes)
     load = time.process_time() - begin
-    meshes = {name: node.to_dataset() for name, node in tree["original"].children.items()}
+    nodes = tree["original"].children
+    meshes = in_one_system({name: node.to_dataset() for name, node in nodes.items()})
     if len(meshes) < 2:
         raise ValueError(f"a collection needs at least 2 shapes, found {len(meshes)}")
     with threadpool_limits(1):

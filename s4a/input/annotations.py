@@ -16,11 +16,11 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from s4a.input.coordinates import CoordinateSystem, map_between, moved
+from s4a.input.coordinates import CoordinateSystem, map_between, moved, only
 from s4a.input.files import stem_of
 from s4a.input.formats import gifti_arrays, ply_properties
 from s4a.input.raw import check_there, content, npy, npz, reading, shown, text_of, xml
-from s4a.options import MILLIMETRES
+from s4a.options import MILLIMETRES, check_unit
 from s4a.schema import dataset, require, unit_of
 
 log = logging.getLogger(__name__)
@@ -281,22 +281,26 @@ def _text_labels(data):
             "one label for every vertex expected, found some vertices (a FreeSurfer label): "
             "convert it to .annot by mris_label2annot"
         )
-    rows = table_rows(text_of(data))
-    header = next(iter(rows.values()))
-    head = [cell.lower() for cell in header]
-    if len(head) > 1 and "label" not in head:
-        raise ValueError(f"a column 'label' needed, found {', '.join(header)}")
-    at, has_head = (head.index("label"), True) if "label" in head else (0, False)
-    cells = _cells(rows, at, has_head)
+    cells = _column(text_of(data), "label", str.lower, lambda head: head == "label")
     if all(map(is_number, cells.values())):
         return np.array([float(cell) for cell in cells.values()])
     return np.array(short(list(cells.values())))
 
 
-def _cells(rows, at, has_head):
-    """Cells of a column by line, in the order of the column ``vertex`` if there is one."""
-    n = len(next(iter(rows.values())))
-    head = [cell.lower() for cell in rows.pop(next(iter(rows)))] if has_head else []
+def _column(text, name, case, is_head):
+    """Cells of a column by line, in the order of the column ``vertex`` if there is one.
+
+    `case` changes the cells of the header; `is_head` says whether a single cell is one.
+    """
+    rows = table_rows(text)
+    header = next(iter(rows.values()))
+    head, n = [case(cell) for cell in header], len(header)
+    if n > 1 and head.count(name) != 1:
+        raise ValueError(f"one column {name!r} needed, found {', '.join(header)[:80]}")
+    at = head.index(name) if n > 1 else 0
+    if n > 1 or is_head(head[0]):
+        del rows[next(iter(rows))]
+    head = [cell.lower() for cell in head]
     _check_cells(rows, n, 1 + at)
     lines = list(rows)
     if n > 1 and "vertex" in head:
@@ -349,18 +353,24 @@ def read_landmarks(path: Path | str) -> xr.Dataset:
         elif re.match(r"\s*version\b", text, re.I):
             reader = _pts_points
         system, rows = (reader or _table_points)(text)
+        # name, position (None if it is not set), curve, closed
+        rows = [(str(row[0]) or str(i), *row[1:], "", False)[:4] for i, row in enumerate(rows, 1)]
+        unset = [name for name, position, *_ in rows if position is None]
+        if unset:
+            text = "%s: landmarks without a position are left out: %s"
+            log.warning(text, shown(path), shown(", ".join(unset)))
+        rows = [row for row in rows if row[1] is not None]
         sizes = {len(position) for _, position, *_ in rows}
         if sizes != {3}:
             raise ValueError(f"points of 3 coordinates needed, found {len(rows)} of {sizes or 0}")
-        # name, position, curve, closed
-        names, positions, curve, closed = zip(*((*row, "", False)[:4] for row in rows), strict=True)
+        names, positions, curve, closed = zip(*rows, strict=True)
         points = np.array(positions, float)
         if not np.isfinite(points).all():
             raise ValueError("points with finite coordinates needed")
         single = [name for name, count in Counter(curve).items() if name and count < 2]
         if single:
             raise ValueError(f"a curve needs at least two points; {single[0]!r} has one")
-        texts = short([str(name) or str(i + 1) for i, name in enumerate(names)])
+        texts = short(list(names))
         curves = short([str(name) for name in curve])
     data = {"landmark_name": np.array(texts), "landmark_position": points}
     if any(curves):
@@ -423,9 +433,6 @@ def _slicer_points(text):
         for m in lists
         for p in (m, *(m.get("controlPoints") or []))
     }
-    if len(systems) != 1 or not systems <= {"LPS", "RAS"}:
-        names = ", ".join(sorted(systems)) or "no markups"
-        raise ValueError(f"one coordinateSystem, LPS or RAS, needed, found {names}")
     rows, taken = [], set()
     for i, m in enumerate(lists, 1):
         curve = ""
@@ -433,23 +440,30 @@ def _slicer_points(text):
             curve = m.get("name") or f"curve_{i}"
             curve = f"{curve}_{i}" if curve in taken else curve
             taken.add(curve)
-        points = m.get("controlPoints") or []  # a region of interest may have none
-        points = [p for p in points if p.get("positionStatus", "defined") == "defined"]
-        rows += [
-            (p.get("label", ""), p["position"], curve, m.get("type") == "ClosedCurve")
-            for p in points
-        ]
+        for p in m.get("controlPoints") or []:  # a region of interest may have none
+            position = p["position"] if p.get("positionStatus", "defined") == "defined" else None
+            rows.append((p.get("label", ""), position, curve, m.get("type") == "ClosedCurve"))
     # a unit may be a list of its code, the scheme of the code and its meaning
     units = {np.ravel(m.get("coordinateUnits") or "mm").tolist()[0] for m in lists}
-    if len(units) != 1 or not units <= {*MILLIMETRES}:
-        raise ValueError(f"one of {', '.join(MILLIMETRES)} as unit needed, found {sorted(units)}")
-    return CoordinateSystem(systems.pop(), "", units.pop()), rows
+    return _system_of(systems, units), rows
+
+
+def _system_of(systems, units):
+    """Coordinate system of landmarks; ValueError if several are stated."""
+    system, unit = only("coordinate system", systems), only("unit", units)
+    return CoordinateSystem.of({"coordinate_system": system, "unit": unit and check_unit(unit)})
 
 
 def _meshlab_points(text):
-    points = [p for p in xml(text).iter("point") if p.get("active") != "0"]
-    rows = [(p.get("name", ""), [p.get(axis) for axis in "xyz"]) for p in points]
+    points = [(p, [p.get(axis) for axis in "xyz"]) for p in xml(text).iter("point")]
+    rows = [(p.get("name", ""), None if p.get("active") == "0" else x) for p, x in points]
     return CoordinateSystem(), rows
+
+
+_NAMES = ("name", "label", "landmark", "point", "id", "")  # the last of an index of pandas
+_TRUE = ("1", "true", "yes")
+# values of points that have a position; numbers: 0 undefined, 1 preview, 2 defined, 3 missing
+_SET = {"positionstatus": ("", "2", "defined"), "defined": ("", *_TRUE)}
 
 
 def _table_points(text):
@@ -459,25 +473,26 @@ def _table_points(text):
     axes, unit = (one[1] if one else "" for one in found)
     if columns.search(text):  # .fcsv of 3D Slicer, of old versions without a system, or with 0
         axes, unit = axes or "0", unit or "mm"
-    attrs = {"coordinate_system": _AXES.get(axes, axes), "unit": unit}
-    system, rows = CoordinateSystem.of(attrs), table_rows(columns.sub("", text, count=1))
+    systems, units = [_AXES.get(axes, axes)], [unit]
+    rows = table_rows(columns.sub("", text, count=1))
     header = next(iter(rows.values()))
     if columns.search(text) and len(header) == 14:
-        # 3D Slicer 5 adds two cells, of which the first is 2 for a point that has a position
-        rows = {n: row[:14] for n, row in rows.items() if row[14:15] in ([], [""], ["2"])}
+        header += ["positionstatus", "created"]  # of 3D Slicer 5, which does not name them
     head = [cell.lower() for cell in header]
-    name, curve, closed = None, None, None
-    letters = next((axes for axes in ("xyz", "lps", "ras") if {*axes} <= {*head}), "")
+    name, curve, closed, status = None, None, None, None
+    systems_of_axes = (a for a in ("xyz", "lps", "ras") if all(head.count(x) == 1 for x in a))
+    letters = next(systems_of_axes, "")
     if letters:
         x = [head.index(axis) for axis in letters]
-        name = next((head.index(n) for n in ("name", "label", "landmark") if n in head), None)
+        name = next((head.index(n) for n in _NAMES if n in head), None)
         curve, closed = (head.index(n) if n in head else None for n in ("curve", "closed"))
         del rows[next(iter(rows))]
+        status = next((head.index(n) for n in _SET if n in head), None)
+        systems += _column_of("coordinate_system", head, rows)
+        units += _column_of("unit", head, rows)
         if letters != "xyz":  # of 3D Slicer
-            system = CoordinateSystem(letters.upper(), "", "mm")
-        if "defined" in head:
-            at = head.index("defined")
-            rows = {line: row for line, row in rows.items() if row[at : at + 1] != ["0"]}
+            systems.append(letters.upper())
+            units = units if any(units) else ["mm"]
     elif len(head) in (3, 4) and all(map(is_number, header[-3:])):
         x = list(range(len(head) - 3, len(head)))
         name = 0 if len(head) == 4 else None
@@ -488,9 +503,16 @@ def _table_points(text):
     points = []
     for line, row in rows.items():
         label, of_curve, is_closed = ("" if i is None else row[i] for i in (name, curve, closed))
-        position = [_number_of(row[i], line) for i in x]
-        points.append((label, position, of_curve, is_closed.lower() in ("1", "true", "yes")))
-    return system, points
+        is_set = status is None or "".join(row[status : status + 1]).lower() in _SET[head[status]]
+        position = [_number_of(row[i], line) for i in x] if is_set else None
+        points.append((label, position, of_curve, is_closed.lower() in _TRUE))
+    return _system_of(systems, units), points
+
+
+def _column_of(name, head, rows):
+    """Cells of a column, if there is one."""
+    at = head.index(name) if name in head else len(head)
+    return [row[at] for row in rows.values() if at < len(row)]
 
 
 def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
@@ -825,7 +847,8 @@ def _values(data, file, name):
         return npy(data)
     if file.endswith(".gii"):
         return _gifti_vector(data, intent=None)
-    return _column(text_of(data), name)
+    cells = _column(text_of(data), name, str, lambda head: not is_number(head))
+    return np.array([_number_of(cell, line) for line, cell in cells.items()])
 
 
 def _curv(data):
@@ -839,13 +862,3 @@ def _curv(data):
             f"{len(data) - 15} bytes"
         )
     return np.frombuffer(data, ">f4", n, 15)
-
-
-def _column(text, name):
-    """Column of that name, or the only one."""
-    rows = table_rows(text)
-    head = next(iter(rows.values()))
-    if len(head) > 1 and name not in head:
-        raise ValueError(f"a column {name!r} expected, found {', '.join(head)[:80]}")
-    at, has_head = (head.index(name), True) if len(head) > 1 else (0, not is_number(head[0]))
-    return np.array([_number_of(cell, line) for line, cell in _cells(rows, at, has_head).items()])

@@ -1,6 +1,5 @@
 """Collections of shapes (5.1, the data): read and clean every file, and report on all."""
 
-import logging
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -27,8 +26,6 @@ from s4a.input.plausibility import examine
 from s4a.input.raw import shown
 from s4a.options import Options, check, check_label
 from s4a.schema import check_type, dataset, in_unit, require
-
-log = logging.getLogger(__name__)
 
 # columns of the report
 COUNTS = [
@@ -117,17 +114,12 @@ def as_mesh(shape: Mesh, what: str = "mesh") -> xr.Dataset:
 
 
 def as_meshes(shapes: dict[str, Mesh], options: Options) -> dict[str, xr.Dataset]:
-    """Return meshes, or those of files, in one coordinate system if all are known.
+    """Return meshes, or those of files, in one coordinate system; `options` for unknown ones.
 
-    The `options` are for files that state none.
+    Raises ValueError if some systems are known and others are not.
     """
     given = options.coordinate_system, options.unit
-    meshes = {n: with_system(as_mesh(one, n), *given) for n, one in shapes.items()}
-    try:
-        return in_one_system(meshes)
-    except ValueError as error:  # each is matched in its own coordinates
-        log.warning("%s", error)
-        return meshes
+    return in_one_system({n: with_system(as_mesh(one, n), *given) for n, one in shapes.items()})
 
 
 def read_shapes(
@@ -197,10 +189,9 @@ def read_shapes(
     >>> list(shapes["original"]), shapes["report"]["status"].values.tolist()
     (['good'], ['excluded', 'ok'])
     """
-    given = {"components": components, "strict": strict, "close_holes": close_holes}
-    for name, value in {**given, "pattern": pattern}.items():
-        check(name, value)
     options = {"components": components, "strict": strict, "close_holes": close_holes}
+    for name, value in {**options, "pattern": pattern}.items():
+        check(name, value)
     system = {"coordinate_system": coordinate_system, "unit": unit}
     with_system(xr.Dataset(), **system)  # an error of the options, not of each file
     label = check_label(label)

@@ -90,19 +90,15 @@ def _check_names(cells, names, what):
 @np.errstate(all="ignore")  # of numbers near the largest
 def _check_numbers(x, names, what):
     """Check a column of numbers."""
-    known = np.isfinite(x)
-    codes = known.copy()
-    codes[known] = missing_codes(x[known])
-    rest = known & ~codes
     cells = [f"{value:.10g}" for value in x]
-    others = f"others {min(x[rest]):.10g} to {max(x[rest]):.10g}" if rest.any() else ""
-    _report_codes(codes, cells, names, what, others)
-    far = rest.copy()
-    far[rest] = outlying(x[rest])
+    known = np.isfinite(x)
+    codes = _mask(missing_codes, x, known)
+    rest = known & ~codes
+    _report_codes(codes, cells, names, what, f"others {_range(x[rest])}" if rest.any() else "")
+    far = _mask(outlying, x, rest)
+    usual = x[rest & ~far]
     if far.any():
-        found = listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(far)])
-        low, high = min(x[rest & ~far]), max(x[rest & ~far])
-        text = f"{what}: outliers, {found} (others {low:.10g} to {high:.10g})"
+        text = f"{what}: outliers, {_named(far, cells, names)} (others {_range(usual)})"
         remaining = np.delete(x[rest], abs(x[rest] - np.median(x[rest])).argmax())
         share = 1 - remaining.var() * len(remaining) / (x[rest].var() * rest.sum())
         if share > _ALONE:
@@ -111,25 +107,39 @@ def _check_numbers(x, names, what):
                 "compare it with all others: correct the value, or write NA"
             )
         log.warning("%s: correct the value, or write NA, if it is wrong; the test uses it", text)
-    for low, high in _two_sizes(x[rest & ~far]):
-        found = f"{min(low):.10g} to {max(low):.10g} and {min(high):.10g} to {max(high):.10g}"
-        log.warning("%s: values of two sizes, %s: are all in one unit?", what, found)
+    sizes = " and ".join(map(_range, _two_sizes(usual)))
+    if sizes:
+        log.warning("%s: values of two sizes, %s: are all in one unit?", what, sizes)
+
+
+def _mask(test, x, known):
+    mask = known.copy()
+    mask[known] = test(x[known])
+    return mask
+
+
+def _range(x):
+    return f"{min(x):.10g} to {max(x):.10g}"
+
+
+def _named(mask, cells, names):
+    return listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(mask)])
 
 
 def _two_sizes(x):
-    """Positive values as two parts, if one is about 100 or 1000 times the other; else nothing."""
+    """Split positive values if one part is about 100 or 1000 times the other; else return ()."""
     x = np.sort(x[x != 0])
     at = 1 + int(np.argmax(np.diff(np.log(x)))) if len(x) > 1 and x[0] > 0 else 0
     low, high = x[:at], x[at:]
-    if min(len(low), len(high)) > 1 and low[-1] < 4 * low[0] and high[-1] < 4 * high[0]:
-        factor = np.log10(np.median(high) / np.median(low))
-        if factor > 1.5 and abs(factor - round(factor)) < 0.2:
-            yield low, high
+    if min(len(low), len(high)) < 2 or low[-1] >= 4 * low[0] or high[-1] >= 4 * high[0]:
+        return ()
+    factor = np.log10(np.median(high) / np.median(low))
+    return (low, high) if factor > 1.5 and abs(factor - round(factor)) < 0.2 else ()
 
 
 def _report_codes(codes, cells, names, what, others):
     """Warn about missing-value codes; ValueError if one is certain."""
-    found = listed([f"{cells[i]} of {names[i]}" for i in np.flatnonzero(codes)])
+    found = _named(codes, cells, names)
     if not found:
         return
     numbers = [float(cells[i]) for i in np.flatnonzero(codes) if is_plain_number(cells[i])]
@@ -195,7 +205,8 @@ def outlying(x: np.ndarray) -> np.ndarray:
 
     A value is compared with the others, and positive ones by their logarithms too, by the t
     distribution of a new observation.  A value that is 10, 100 or 1000 times one in their range, as
-    290 for 29, or of the other sign, needs less evidence.
+    290 for 29, or of the other sign, needs less evidence, and is enough if it alone has decimals,
+    as 3.1 for 31.
 
     Examples
     --------
@@ -223,6 +234,8 @@ def _is_outlying(value, rest, n):
     low, high = np.quantile(rest, [0.1, 0.9])
     slips = value / np.array([1e-3, 1e-2, 0.1, 10, 100, 1000, -1])
     is_slip = 0 < high < 4 * low and ((slips >= low) & (slips <= high)).any()
+    if is_slip and value % 1 and not (rest % 1).any():  # 3.1 among integers
+        return True
     return _p_value(value, rest) * n < (_SLIP_LEVEL if is_slip else _LEVEL)
 
 

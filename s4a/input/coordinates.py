@@ -6,7 +6,7 @@ text such as those in :data:`EXAMPLES`, and ``unit``.  Code that combines files 
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 from typing import Any, Self
@@ -208,6 +208,14 @@ def common(systems: Mapping[str, CoordinateSystem], *, origin: bool = False) -> 
     return max(groups, key=lambda system: len(groups[system]), default=CoordinateSystem())
 
 
+def only(what: str, texts: Iterable[str]) -> str:
+    """Return the text of all, apart from empty ones, or ValueError if there are several."""
+    found = sorted({*texts} - {""})
+    if len(found) > 1:
+        raise ValueError(f"one {what} expected, found {' and '.join(found)}: correct the file")
+    return "".join(found)
+
+
 # meshes
 
 
@@ -298,15 +306,14 @@ def system_in(data: bytes, kind: str) -> CoordinateSystem:
         return CoordinateSystem("RAS", "", "mm")
     # 3D Slicer, whose unit is mm, writes SPACE into a title or comment, or into fields of VTK files
     head = data[:1000]
-    space = re.search(rb"\bSPACE=([RLAPSI]{3})\b", head)
+    found = re.findall(rb"\bSPACE=([RLAPSI]{3})\b", head)
     unit = re.search(rb"UNIT=(um|mm|cm|m|in)\b", head)
-    axes = space[1].decode() if space else ""
-    if kind == "VTK" and not space:
-        field = re.search(rb"\nSPACE 1 1 string\r?\n[\xc3\s]*([RLAPSI]{3})\s", data)
-        axes = field[1].decode() if field else ""
-    if kind == "VTP" and not space and b"SPACE" in data:
-        axes = next(iter(VtkXml(data).strings("SPACE")), "")
-    axes = axes if axes in AXES else ""
+    if kind == "VTK":
+        found += re.findall(rb"\nSPACE 1 1 string\r?\n[\xc3\s]*([RLAPSI]{3})\s", data)
+    spaces = [space.decode() for space in found]
+    if kind == "VTP" and b"SPACE" in data:
+        spaces += VtkXml(data).strings("SPACE")
+    axes = only("SPACE", (space for space in spaces if space in AXES))
     origin = re.search(rb" ORIGIN=(\w+)", head)
     default = "mm" if axes and b"S4A SPACE" not in head else ""
     place = origin[1].decode() if origin and axes else ""
@@ -332,10 +339,12 @@ def surface_system(M: Any) -> CoordinateSystem:
     """Return surface RAS, or LAS if mirrored, with the map (3, 4) of its points to scanner RAS."""
     M = np.reshape(np.asarray(M, float), (3, 4))
     axes = "LAS" if np.linalg.det(M[:, :3]) < 0 else "RAS"  # of a left-handed volume: mirrored
-    M = M @ np.diag([-1 if axes == "LAS" else 1, 1, 1, 1]) + 0.0
+    scale = abs(np.linalg.det(M[:, :3])) ** (1 / 3)  # 1000 for points in metres
+    unit = next((unit for unit, mm in MILLIMETRES.items() if abs(scale / mm - 1) < 0.01), "mm")
+    M = M / [*3 * [MILLIMETRES[unit]], 1] @ np.diag([-1 if axes == "LAS" else 1, 1, 1, 1]) + 0.0
     numbers = " ".join(map(repr, M.ravel().tolist()))
     return CoordinateSystem.of(
-        {"coordinate_system": f"surface {axes}, to scanner RAS {numbers}", "unit": "mm"}
+        {"coordinate_system": f"surface {axes}, to scanner RAS {numbers}", "unit": unit}
     )
 
 
@@ -354,8 +363,8 @@ def _of_gifti(data):
     for node in points.iter("CoordinateSystemTransformMatrix"):
         texts = [node.findtext(tag) or "" for tag in ("DataSpace", "TransformedSpace")]
         here, there = (SPACES.get(t.strip().removeprefix("NIFTI_XFORM_"), 0) for t in texts)
-        if here:
-            return CoordinateSystem("RAS", XFORMS.get(here, ""), "mm")
+        if here:  # Connectome Workbench writes Talairach into every file, whatever its space
+            return CoordinateSystem("RAS", UNKNOWN if here == 3 else XFORMS.get(here, ""), "mm")
         maps[there] = (node.findtext("MatrixData") or "").split()
     meta = {m.findtext("Name"): m.findtext("Value") for m in root.iter("MD")}
     geometry = [[meta.get(f"VolGeom{a}_{b}") for b in "RAS"] for a in "XYZC"]

@@ -24,6 +24,7 @@ from s4a.input.raw import check_there, content, regular_file, shown
 SUFFIXES = {suffix: name for name, kind in FORMATS.items() for suffix in kind.suffixes.split()}
 SUFFIXES[".obj"] = "OBJ"  # and of MNI
 WRITERS = {kind.suffixes.split()[0]: kind.write for kind in FORMATS.values() if kind.write}
+WITH_VALUES = [suffix for suffix in WRITERS if FORMATS[SUFFIXES[suffix]].scalars]
 LONGEST_NAME = 100  # characters of a shape's name, as files of a study are named after it
 OTHERS = ".json .csv .txt .md .html .png .jpg .nc .npy .annot .nii".split()  # not meshes
 # grapheme joiner, variation selectors, fillers of Hangul and the blank of Braille
@@ -38,10 +39,10 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dic
     Parameters
     ----------
     path : str or Path
-        PLY, OBJ (also of MNI), OFF, STL, VTK legacy polydata, VTP, GIFTI, FreeSurfer surface, MZ3,
-        or NPZ with the keys V and F, vertices and faces, points and triangles, position and
-        corner_vertex, or X and T.  Files may be compressed by gzip (.ply.gz).  The limit is 2 GiB,
-        or 1 GiB unpacked.  Polygons are split into triangles.
+        A file in one of :data:`s4a.input.formats.FORMATS`, such as PLY, OBJ, STL, VTK, GIFTI or
+        FreeSurfer surface, or NPZ with the keys V and F, vertices and faces, points and triangles,
+        position and corner_vertex, or X and T.  Files may be compressed by gzip (.ply.gz).  The
+        limit is 2 GiB, or 1 GiB unpacked.  Polygons are split into triangles.
 
     Returns
     -------
@@ -182,14 +183,15 @@ def write_mesh(
     Parameters
     ----------
     path : str or Path
-        Name ending in .ply (binary), .obj, .off, .stl, .vtk, .vtp, .gii or .npz.
+        Name whose suffix is one of :data:`WRITERS`, such as .ply (binary), .stl, .vtk or .gii.
     points : float ndarray (n, 3)
     triangles : int ndarray (m, 3)
     coordinate_system, unit : str, optional
         Written into the header, as by 3D Slicer, except for NPZ.  Coordinates in FreeSurfer's
         surface RAS are converted to scanner RAS, and for GIFTI to RAS and mm.
     **vertex_scalars : float ndarray (n,)
-        Values per vertex by name, in PLY, VTK, VTP, GIFTI (float32) and NPZ.
+        Values per vertex by name, stored as float32 except in NPZ; the suffix must be one of
+        :data:`WITH_VALUES`.
 
     Raises
     ------
@@ -223,9 +225,10 @@ def write_mesh(
     suffix = path.suffix.lower()
     if suffix not in WRITERS:
         raise ValueError(f"a name ending in {', '.join(WRITERS)} needed, found {path.name}")
-    if scalars and not FORMATS[SUFFIXES[suffix]].scalars:
+    if scalars and suffix not in WITH_VALUES:
         raise ValueError(
-            f"{suffix} cannot hold values per vertex; write .ply, .vtk, .vtp, .gii or .npz"
+            f"{suffix} cannot hold values per vertex; write {', '.join(WITH_VALUES[:-1])} or "
+            f"{WITH_VALUES[-1]}"
         )
     system = CoordinateSystem.of({"coordinate_system": coordinate_system, "unit": unit})
     written = system.in_world(*["RAS", "mm"] if suffix == ".gii" else [])

@@ -2,7 +2,8 @@
 
 A pose of a shape is a rigid transform onto the reference.  Several are found by ICP from the
 principal axes.  Other aligned shapes vote: the pose that fits the reference and all of them best is
-used, so poses are consistent around the cycles of the network.
+used, so poses are consistent around the cycles of the network.  If several are equally good, the
+pose of the files is used where ICP from it fits nearly as well and rotates the shape little.
 """
 
 import itertools
@@ -30,7 +31,7 @@ from s4a.input.plausibility import flag
 from s4a.method import spectral_icp
 from s4a.method.shape import Basis, corresponding_landmarks
 from s4a.options import check
-from s4a.schema import POSE
+from s4a.schema import POSE, Array
 
 N_VOTERS = 6
 # poses are equally good if the root mean square residual to the voters is at most ALIKE times that
@@ -38,6 +39,7 @@ N_VOTERS = 6
 # the difference of squares).  Shapes of a collection differ by about 0.04.  With fewer vertices
 # than ENOUGH their spacing hides part of the difference: ALIKE is lower, and NEARLY does not apply
 ALIKE, NEARLY, SAME, ENOUGH = 1.07, 1.2, 0.008, 400
+AS_GIVEN = 20.0  # degrees by which ICP from the pose of the files may rotate it
 _COLLINEAR = 0.02  # of sqrt(area): landmarks this close to a line do not determine a rotation
 IDENTITY = np.eye(3), np.zeros(3)
 
@@ -47,8 +49,8 @@ class Alignment(NamedTuple):
 
     R: np.ndarray  # (3, 3)
     t: np.ndarray  # (3,)
-    fits: tuple[float, ...] = (0.0,)  # residuals of equally good poses, the best first
-    angle: float = 0.0  # degrees between the best and the second of them
+    fits: tuple[float, ...] = (0.0,)  # residuals of equally good poses, the least first
+    angle: float = 0.0  # degrees between the first and the second of them
 
     @property
     def transform(self) -> RigidTransform:
@@ -168,6 +170,9 @@ def _after(first: RigidTransform, second: RigidTransform) -> RigidTransform:
 def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Alignment:
     """Choose the pose with the least mean squared residual to the voters.
 
+    If several are equally good, the result of ICP from the pose of the files is chosen, provided
+    that it fits nearly as well and is within ``AS_GIVEN`` degrees of that pose.
+
     Parameters
     ----------
     source : Basis
@@ -176,12 +181,7 @@ def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Ali
     found : sequence of tuple (R, t)
         Poses of the source on the reference.
     """
-    rows = []
-    for other, onto in voters.values():
-        starts = [relative_transform(pose, onto) for pose in found]
-        ends = icp_each(source.cloud, other.cloud, starts, tolerance=5 * ROUGH)
-        rows.append([residual**2 for *_, residual in ends])
-    squared = np.array(rows)  # (voters, poses)
+    squared = _squared_residuals(source, voters, found)
     order = np.argsort(squared.mean(0), kind="stable")
     squared, (R, t) = squared[:, order], found[order[0]]
     residual = np.sqrt(squared.mean(0))
@@ -191,9 +191,27 @@ def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Ali
     fits = tuple(residual[alike].tolist())
     if len(fits) < 2 or _differs(source, voters, (R, t)):
         return Alignment(R, t, fits[:1])
-    second = found[order[np.flatnonzero(alike)[1]]][0]
-    cosine = (np.trace(R.T @ second) - 1) / 2
-    return Alignment(R, t, fits, float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))))
+    angle = _degrees(R.T @ found[order[np.flatnonzero(alike)[1]]][0])
+    S, u = realign(source.cloud, next(iter(voters.values()))[0].cloud, IDENTITY)
+    fit = np.sqrt(_squared_residuals(source, voters, [(S, u)]).mean())
+    if _degrees(S) < AS_GIVEN and fit < NEARLY * fits[0]:
+        R, t = S, u
+    return Alignment(R, t, fits, angle)
+
+
+def _squared_residuals(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Array:
+    """Return the squared residuals (voters, poses) of ICP from each pose to each voter."""
+    rows = []
+    for other, onto in voters.values():
+        starts = [relative_transform(pose, onto) for pose in found]
+        ends = icp_each(source.cloud, other.cloud, starts, tolerance=5 * ROUGH)
+        rows.append([residual**2 for *_, residual in ends])
+    return np.array(rows)
+
+
+def _degrees(R: Array) -> float:
+    """Return the angle of a rotation."""
+    return float(np.rad2deg(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))
 
 
 def _differs(source: Basis, voters: Voters, pose: RigidTransform) -> bool:

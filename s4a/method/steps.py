@@ -24,16 +24,11 @@ from s4a.method.latent import (
 from s4a.method.median import median_shape
 from s4a.method.register import from_latent, identity, match_functions, match_low
 from s4a.method.shape import Basis, Shape
-from s4a.options import DECLARED, N_SAMPLES, check, kept_options
+from s4a.options import N_SAMPLES, check, kept_options, names_of
 from s4a.schema import check_count, check_type, dataset, require
 
-PROJECTION = [name for name, option in DECLARED.items() if option.metadata["of"] == "projection"]
-REGISTRATION = [
-    *(name for name, option in DECLARED.items() if option.metadata["of"] == "registration"),
-    "alignment",
-    "dense_match",
-    *PROJECTION,
-]
+PROJECTION = names_of("projection")
+REGISTRATION = [*names_of("registration"), "alignment", "dense_match", *PROJECTION]
 LOW = ("position", "corner_vertex", "vertex_area", "eigenvalue", "eigenfunction")
 
 
@@ -724,10 +719,9 @@ def register_shape(
         Match by the latent bases (eq. 7), or by functional maps (eq. 3 and 4).  By default as in
         the report of the study.
     **options
-        ``refine``, ``remove_size``, ``articulated``, ``alignment``, ``displacement_alignment``,
-        ``n_projected`` and ``area_weighted``.  :class:`s4a.Options` describes them.  Options that
-        are missing or None have the values in the report of the study, or their defaults if there
-        is no report.
+        Those of :class:`s4a.Options` for registrations, such as ``refine`` and ``remove_size``;
+        the message about another one lists them.  Options that are missing or None have the values
+        in the report of the study, or their defaults if there is no report.
 
     Returns
     -------

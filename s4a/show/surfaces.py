@@ -20,11 +20,12 @@ SAMPLES = "samples of SCALABLE with an edge between adjacent cells"
 
 
 def has(study: xr.DataTree, name: str) -> bool:
-    """Return True if the study has the node, or the variable ``node/variable``."""
+    """Return True if the study has the node with content, or the variable ``node/variable``."""
     node, _, variable = name.partition("/")
     if node not in study.children:
         return False
-    return variable in study[node].data_vars if variable else bool(study[node].children)
+    found = study[node]
+    return variable in found.data_vars if variable else bool(found.children or found.data_vars)
 
 
 def attribute(study: xr.DataTree, node: str, name: str) -> str:

@@ -5,18 +5,22 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from joblib import delayed
 from threadpoolctl import threadpool_limits
 
 from s4a.input.collection import Mesh, as_meshes
+from s4a.input.coordinates import in_one_system
 from s4a.method import fmap
 from s4a.method.alignment import align_onto, alignment_residual, less_confident
 from s4a.method.initial_map import initial_map
 from s4a.method.refined_eigenfunctions import low_resolution
-from s4a.method.register import refine_at_full_resolution, register
+from s4a.method.register import identity, refine_at_full_resolution, register
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
-from s4a.schema import dataset
+from s4a.schema import check_type, dataset
+from s4a.study.processes import workers
 from s4a.study.quality_control import check_pair
+from s4a.study.tree import stack_registration, template_mesh
 
 log = logging.getLogger(__name__)
 
@@ -47,9 +51,8 @@ def match_pair(
         Whether to return map and match of every iteration of ZoomOut, and the descriptors of the
         initial map.
     **options
-        ``n_coarse, k_init, k, step, init, initial_refinement, full_resolution_iterations, refine,
-        articulated, refined_eigenfunctions, alignment, sampling, area_weighted, n_projected,
-        method, seed`` or ``rng``.  :class:`s4a.Options` describes them and has their defaults.
+        Those of :class:`s4a.Options` that apply to pairs, such as ``n_coarse``, ``k``, ``refine``
+        and ``seed`` (or ``rng``); the message about another one lists them.
 
     Returns
     -------
@@ -84,7 +87,8 @@ def match_pair(
     Raises
     ------
     ValueError
-        If a mesh lacks variables, or an option is out of range or contradicts the preset.
+        If a mesh lacks variables, the coordinate system of one mesh only is known, or an option is
+        out of range or contradicts the preset.
 
     See Also
     --------
@@ -121,8 +125,8 @@ def match_pair(
     settings = given_options({"preset": preset, **options}, pair=True)
     settings = settings.changed({"keep_iterations": keep_iterations})
     meshes = as_meshes({"source": source, "target": target}, settings)
-    with threadpool_limits(1):  # matrices are small: more BLAS threads take longer
-        M, N = (shape_of(mesh, settings) for mesh in meshes.values())
+    M, N = (shape_of(mesh, settings) for mesh in meshes.values())
+    with threadpool_limits(1):
         registration, maps = match_shapes(M, N, settings)
     least = min(M.low.k, N.low.k)
     if least < settings.k:
@@ -136,9 +140,9 @@ def match_pair(
 
 def shape_of(mesh: xr.Dataset, options: Options) -> Shape:
     """Make the shape of a mesh, with low resolution and eigenfunctions."""
-    return Shape(
-        mesh, low_resolution(mesh, **options.of("low resolution")), **options.of("projection")
-    )
+    with threadpool_limits(1):  # matrices are small: more BLAS threads take longer
+        low = low_resolution(mesh, **options.of("low resolution"))
+        return Shape(mesh, low, **options.of("projection"))
 
 
 def match_shapes(source: Shape, target: Shape, options: Options) -> tuple[xr.Dataset, xr.Dataset]:
@@ -212,9 +216,128 @@ def _complete(source, target, initial, transform, k, options):
     return registration, C, kept
 
 
+def match_both(
+    shape: Shape, template: Shape, options: Options
+) -> tuple[xr.Dataset, xr.Dataset | None]:
+    """Register a shape to a template and, with `bidirectional`, the template to the shape."""
+    with threadpool_limits(1):
+        forth = match_shapes(shape, template, options)[0]
+        return forth, match_shapes(template, shape, options)[0] if options.bidirectional else None
+
+
 def log_warning(registration: xr.Dataset, name: str) -> None:
     """Log the warning of a registration of :func:`match_shapes`, if it has one."""
     if registration.attrs["warning"]:
         log.warning(
             "%s is %s: %s", name, registration.attrs["status"], registration.attrs["warning"]
         )
+
+
+def register_pairs(
+    template: Mesh,
+    shapes: dict[str, Mesh],
+    *,
+    name: str = "template",
+    n_jobs: int | None = None,
+    preset: str | None = None,
+    **options: Any,
+) -> xr.DataTree:
+    """Register a template to each shape without a network (6.2), for transfer.
+
+    Parameters
+    ----------
+    template : path or Dataset
+        Mesh file, or clean mesh, such as :func:`s4a.read_shape` returns.
+    shapes : dict of str to path or Dataset
+        Name -> mesh file, or clean mesh.
+    name : str
+        Name of the template.
+    n_jobs : int, optional
+        Number of parallel processes, as in joblib: -1 for all cores, None for one.  The result does
+        not depend on it.
+    preset : {None, "paper", "fast"}
+        Presets of :func:`s4a.match_pair`.  ``"paper"`` also sets bidirectional=False, and blur=0 in
+        :func:`s4a.transfer_labels`.
+    **options
+        Options of :func:`s4a.match_pair`, and ``bidirectional``.  By default, each pair is matched
+        in both directions, and a transfer averages both.  :class:`s4a.Options` describes them.
+
+    Returns
+    -------
+    DataTree
+        A study with the nodes
+
+        - ``/original``: meshes of the template and of the shapes;
+        - ``/registration``: registration of each shape to the template; the attributes ``status``
+          and ``warning`` of ``/registration/NAME`` flag registrations that are probably wrong, as
+          in :func:`s4a.match_pair`;
+        - ``/reverse``: registration of the template to each shape, with `bidirectional`.
+
+    Raises
+    ------
+    ValueError
+        If a shape has the name of the template, a mesh lacks a variable, the coordinate systems of
+        some meshes only are known, or an option is out of range or contradicts the preset.
+
+    See Also
+    --------
+    match_pair : Match one pair.
+    s4a.analyse : Register a collection by a network.
+    s4a.transfer_labels, s4a.transfer_scalars, s4a.transfer_landmarks : Use the registrations.
+
+    Examples
+    --------
+    >>> import s4a
+    >>> brains = s4a.synthetic.brains(6, 200)
+    >>> source = brains["original/brain_01"].to_dataset()
+    >>> target = brains["original/brain_02"].to_dataset()
+    >>> pairs = s4a.register_pairs(source, {"brain_02": target}, n_coarse=100, k_init=6, k=10)
+    >>> s4a.transfer_labels(pairs, source["label"].values)["brain_02"]["label"].sizes["vertex"]
+    200
+    """
+    check_type(shapes, dict, "shapes")
+    if name in shapes or not shapes:
+        raise ValueError(
+            f"shapes other than the template {name!r} are needed; found "
+            f"{', '.join(shapes) or 'none'}"
+        )
+    settings = given_options({"preset": preset, **options}, pair=True)
+    meshes = as_meshes({name: template, **shapes}, settings)
+    parallel = workers(n_jobs)
+    inside, *others = parallel(delayed(shape_of)(mesh, settings) for mesh in meshes.values())
+    pairs = parallel(delayed(match_both)(shape, inside, settings) for shape in others)
+    forth, back = (dict(zip(shapes, side, strict=True)) for side in zip(*pairs, strict=True))
+    back = back if settings.bidirectional else {}
+    for words, side in (("", forth), (" in reverse", back)):
+        for n, registration in side.items():
+            log_warning(registration, f"{n}{words}")
+    study = _study_of(name, meshes.pop(name), meshes, forth, back)
+    study["registration"].attrs["preset"] = settings.preset or ""
+    return study
+
+
+def pair_study(result: xr.Dataset, source: xr.Dataset, target: xr.Dataset) -> xr.DataTree:
+    """Convert a result of :func:`s4a.match_pair` to a study, with the target as template.
+
+    Parameters
+    ----------
+    result, source, target : Dataset
+        The result, and the two meshes.
+
+    Returns
+    -------
+    DataTree
+        ``/original``, ``/registration``, for :mod:`s4a.analysis.transfer`.
+    """
+    registered = result.rename(match="registered_match")
+    meshes = in_one_system({"source": source, "target": target})  # as the result
+    return _study_of("target", meshes.pop("target"), meshes, {"source": registered}, {})
+
+
+def _study_of(name, template, shapes, forth, back):
+    """Registered study; `forth` are registrations of the shapes, `back` of the template."""
+    meshes = {name: template, **shapes}
+    nodes = {f"original/{n}": mesh for n, mesh in meshes.items()}
+    files = {name: identity(Shape(template)), **forth}
+    nodes |= stack_registration(template_mesh(template, name), files, list(meshes))
+    return xr.DataTree.from_dict(nodes | {f"reverse/{n}": data for n, data in back.items()})

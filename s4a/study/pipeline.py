@@ -300,13 +300,7 @@ def choose_reflected(
 
 def remesh(run: Run, original: Keys, options: Options) -> Keys:
     """Remesh the shapes and compute their spectra (4.1, step 1): ``/coarse``."""
-    settings: tuple[Any, ...] = (options.n_coarse, options.wrap, options.seed, options.k)
-    if options.refined_eigenfunctions:
-        settings = (*settings, "refined eigenfunctions")
-    if options.method != "rematch":
-        settings = (*settings, options.method)
-    if options.sampling != "normals":
-        settings = (*settings, options.sampling)
+    settings = options.of("low resolution")
     todo = []
     for n, key in original.items():
         arguments, made_from = (run.folder, n, options), names_and_keys("original", {n: key})
@@ -393,10 +387,8 @@ def consistent_zoomout(run: Run, coarse: Keys, initial: Keys, options: Options) 
     str
         The key of both files.
     """
-    settings = (options.k, options.step, options.n_latent, options.norm)
-    of_maps = (options.weights, options.isometric, options.n_samples)
-    of_iterations = (options.dense_iterations, options.keep_iterations)
-    key = task_key(list(initial.values()), *settings, *of_maps, *of_iterations)
+    settings = (options.k, options.n_samples, options.of("Consistent ZoomOut"))
+    key = task_key(list(initial.values()), *settings)
     old_files = list((run.folder / "iterations").glob("k_*.nc")) if options.keep_iterations else []
     files = [run.folder / "network.nc", run.folder / "latent.nc", *old_files]
     done = bool(old_files) == options.keep_iterations and all(is_done(file, key) for file in files)
@@ -460,10 +452,9 @@ def insert_excluded(run: Run, aligned: Keys, excluded: Keys, latent: str, option
 def register(run: Run, coarse: Keys, inserted: Keys, latent: str, options: Options) -> Keys:
     """Register every shape to the template, the median shape by default (4.2, eq. 6 to 8)."""
     template = options.template or attributes(run.folder / "latent.nc")["median"]
-    projection = (options.area_weighted, options.n_projected)
-    registration = {"alignment": options.alignment, **options.of("registration")}
-    settings = (template, options.dense_match, registration, projection)
-    template_key = task_key(latent, settings)
+    settings = (options.dense_match, options.alignment)
+    of_steps = (options.of("registration"), options.of("projection"))
+    template_key = task_key(latent, template, *settings, *of_steps)
     mesh = template_mesh(read(run.folder / f"original/{template}.nc"), template)
     if inserted:
         mesh.attrs["excluded"] = " ".join(inserted)

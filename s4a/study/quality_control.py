@@ -232,12 +232,13 @@ def check_usable(run: Run, coarse: Keys, options: Options) -> None:
 def check_registrations(run: Run, registered: Keys, inserted: Keys) -> tuple[Flags, list[str]]:
     """Flag the registrations of the network that are probably wrong; see :func:`flagged`."""
     names = [name for name in registered if name not in inserted]
-    files = {name: run.folder / f"registration/{name}.nc" for name in names}
-    registration_error = {name: attributes(file)["score"] for name, file in files.items()}
+    files = {name: open_file(run.folder / f"registration/{name}.nc") for name in names}
+    registration_error = {name: file.attrs["score"] for name, file in files.items()}
     distortion = {
-        name: float(np.abs(arrays(file, "distortion")[0]).mean()) for name, file in files.items()
+        name: float(abs(file["distortion"].values).mean()) for name, file in files.items()
     }
-    return flagged(registration_error, distortion)
+    n = {name: min(f.sizes["vertex"], f.sizes["original_vertex"]) for name, f in files.items()}
+    return flagged(registration_error, distortion, n)
 
 
 def check_modes(pca: xr.Dataset, area: float) -> Flags:
@@ -297,8 +298,7 @@ def check_modes(pca: xr.Dataset, area: float) -> Flags:
 def check_pair(score: float, distortion: float, n: int, options: Options) -> dict[str, str]:
     """Return status and warning of a single registration, by the limits of :func:`flagged`.
 
-    There is no collection to compare with.  On coarse meshes correct registrations score up to
-    1.2 times the vertex spacing 1 / sqrt(n), so those below twice the spacing are not flagged.
+    There is no collection to compare with.
 
     Parameters
     ----------
@@ -323,9 +323,7 @@ def check_pair(score: float, distortion: float, n: int, options: Options) -> dic
     >>> check_pair(0.078, 0.17, 200, Options())
     {'status': 'ok', 'warning': ''}
     """
-    found: Flags = {}
-    if score > WRONG_RATIO / np.sqrt(n):
-        found, _ = flagged({"pair": score}, {"pair": distortion}, usual=0.0)
+    found, _ = flagged({"pair": score}, {"pair": distortion}, {"pair": n}, usual=0.0)
     found = unflagged(found) if options.quality_control == "off" else found
     is_flagged = any(one.flagged for one in found.get("pair", []))
     return {
@@ -337,9 +335,13 @@ def check_pair(score: float, distortion: float, n: int, options: Options) -> dic
 def flagged(
     registration_error: dict[str, float],
     distortion: dict[str, float] | None = None,
+    n: dict[str, int] | None = None,
     usual: float | None = None,
 ) -> tuple[Flags, list[str]]:
     """Flag shapes by their registration error, alone and times distortion.
+
+    On coarse meshes correct registrations score up to 1.2 times the vertex spacing 1 / sqrt(n), so
+    those below twice the spacing are not flagged.
 
     Parameters
     ----------
@@ -348,6 +350,8 @@ def flagged(
     distortion : dict of str to float, optional
         Mean |distortion|.  A wrong map misses the surface and distorts, so the product separates
         better than either number.
+    n : dict of str to int, optional
+        Number of vertices of the coarser surface.
     usual : float, optional
         Product of a usual registration; by default the median.
 
@@ -365,16 +369,19 @@ def flagged(
     >>> list(flags), remarks
     (['wrong'], [])
     """
-    distortion = distortion or {}
+    distortion, n = distortion or {}, n or {}
     product = {
         name: score * distortion.get(name, 0.0) for name, score in registration_error.items()
     }
     if usual is None:
         usual = float(np.median([value for value in product.values() if value > 0] or [0.0]))
     limit, warning_limit = max(WRONG, WRONG_RATIO * usual), max(UNSURE, UNSURE_RATIO * usual)
-    wrong = {
-        n: score for n, score in registration_error.items() if score > FLAGGED or product[n] > limit
+    visible = {
+        name: score
+        for name, score in registration_error.items()
+        if score > WRONG_RATIO / np.sqrt(n.get(name, np.inf))
     }
+    wrong = {m: score for m, score in visible.items() if score > FLAGGED or product[m] > limit}
     if len(registration_error) > 2 and len(wrong) > len(registration_error) / 2:
         return {}, [
             f"{len(wrong)} of {len(registration_error)} registrations are flagged "
@@ -382,7 +389,7 @@ def flagged(
             "try another template, a larger n_coarse or k"
         ]
     flags: Flags = {}
-    for name, score in registration_error.items():
+    for name, score in visible.items():
         if name not in wrong and product[name] <= warning_limit:
             continue
         sure = "probably wrong" if name in wrong else "possibly wrong in parts"

@@ -33,6 +33,7 @@ from s4a.study.runner import Run
 from s4a.study.sources import Guides, content_of_file
 
 NO_GUIDES = Guides(None, {})
+OF_FILES = ("label", "coordinate_system", "unit")  # options of reading; others are of `clean`
 last_template: dict[tuple[Any, ...], Shape] = {}  # at most one
 
 
@@ -84,10 +85,8 @@ def cleaned(source: str | xr.Dataset, content: str, cleaning: dict[str, Any]) ->
         area = float(triangle_areas(*as_arrays(source)).sum())
         mesh = source.assign_attrs({"status": "ok", "reason": "", "area": area} | source.attrs)
     else:
-        mesh = clean(
-            source, **{name: cleaning[name] for name in ("components", "strict", "close_holes")}
-        )
-        mesh = guided(mesh, source)
+        repair = {name: value for name, value in cleaning.items() if name not in OF_FILES}
+        mesh = guided(clean(source, **repair), source)
     return in_unit(mesh, source.attrs.get("unit"))
 
 
@@ -201,14 +200,8 @@ def consistent_maps(
         coarse,
         initial,
         k=options.k,
-        step=options.step,
-        n_latent=options.n_latent,
-        weights=options.weights,
-        isometric=options.isometric,
         n_samples=options.n_samples,
-        dense_iterations=options.dense_iterations,
-        norm=options.norm,
-        keep_iterations=options.keep_iterations,
+        **options.of("Consistent ZoomOut"),
         n_jobs=n_jobs,
         progress=lambda size: bar.update(size - k_init - bar.n),
     )

@@ -34,13 +34,17 @@ PANELS = {
 STAGES = ("original", "coarse", "network", "latent", "registration", "pca")  # nodes of every study
 
 
+def known_panels() -> dict[str, type[Panel]]:
+    """Return title -> panel class of the core and of extensions."""
+    return PANELS | {kind.title: kind for kind in extensions("s4a.panels").values()}
+
+
 def kinds_of(study: xr.DataTree) -> dict[str, type[Panel]]:
     """Return title -> panel class, if the study has, or will have, what the panel needs."""
-    known = PANELS | {kind.title: kind for kind in extensions("s4a.panels").values()}
     expected = STAGES if not study.children or set(STAGES) & set(study.children) else ()
     kinds = {
         title: kind
-        for title, kind in known.items()
+        for title, kind in known_panels().items()
         if all(has(study, need) or need.partition("/")[0] in expected for need in kind.needs)
     }
     return kinds or PANELS
@@ -170,7 +174,10 @@ class Explore(KernelWidget):
     def __getitem__(self, title: str) -> ipywidgets.Widget:
         """Open a tab and return its panel."""
         if title not in self.kinds:
-            raise ValueError(f"there is no tab {title!r}; there are {', '.join(self.kinds)}")
+            needs = getattr(known_panels().get(title), "needs", ())
+            lacking = ", ".join(need for need in needs if not has(self.study, need))
+            why = f", as the study lacks {lacking}" if lacking else ""
+            raise ValueError(f"there is no tab {title!r}{why}; there are {', '.join(self.kinds)}")
         self.tabs.selected_index = list(self.kinds).index(title)
         if title not in self.panels:
             ready = [

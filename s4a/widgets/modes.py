@@ -7,7 +7,7 @@ import numpy as np
 import traitlets
 
 from s4a.geometry.mesh import vertex_normals
-from s4a.input.files import write_mesh
+from s4a.input.files import WITH_VALUES, write_mesh
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import apply_scores, mahalanobis, plausible_scores
 from s4a.show.browser import MODES, appearance_state, mesh_state, to_bytes
@@ -25,7 +25,6 @@ from s4a.widgets.panel import Panel, dropdown, file_name, row
 from s4a.widgets.views import View
 
 LARGE = 40e6  # bytes of the deformations above which the default is the low resolution
-BARE = (".obj", ".off", ".stl")  # formats without values at the vertices
 
 
 class ModesView(View):
@@ -198,7 +197,7 @@ class Modes(Panel):
         path = Path(path)
         mean, T, _ = self.arrays("full")
         X, values = self.vertices(), {}
-        if path.suffix.lower() not in BARE:
+        if path.suffix.lower() in WITH_VALUES:
             along = normal_displacement(X - mean, vertex_normals(mean, T))
             values["normal_displacement"] = along.astype(np.float32)
         write_mesh(path, X, T, **values)

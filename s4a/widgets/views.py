@@ -351,7 +351,21 @@ class Chart(anywidget.AnyWidget):
     palette = traitlets.Bytes(palette(SIGNED)).tag(sync=True)
 
     def draw(self, kind: str, **spec: Any) -> None:
-        """Draw ``scatter``, ``bars``, ``lines`` or ``graph``; chart.js has the keys of `spec`."""
+        """Draw a chart of arrays and texts; chart.js has further keys.
+
+        Parameters
+        ----------
+        kind : {"scatter", "bars", "lines", "graph"}
+        **spec
+            ``title`` of all, and
+
+            - scatter: ``x``, ``y``, ``names``, ``xlabel``, ``ylabel``; ``selected``, an index;
+            - bars: ``names``, ``values``, ``label``; ``selected``; ``marked``, a list of indices;
+            - lines: ``xlabel``, ``ylabel``, and ``series``, dicts of ``x``, ``y``, ``name``, and
+              optionally ``color``, ``dots``, ``legend``;
+            - graph: ``x``, ``y``, ``names`` of the nodes, and ``source``, ``target``, ``colors``,
+              ``values``, ``edges``, ``label`` of the edges.
+        """
         with self.hold_sync():
             self.answer = -1
             self.spec = plain({"kind": kind, **spec})

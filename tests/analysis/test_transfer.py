@@ -25,7 +25,7 @@ from s4a import (
     transfer_scalars,
     write_mesh,
 )
-from s4a.analysis.transfer import diffuse_votes, majority, pair_study, votes_of
+from s4a.analysis.transfer import diffuse_votes, majority, votes_of
 from s4a.geometry.closest import (
     closest_facing_point,
     closest_point,
@@ -43,6 +43,7 @@ from s4a.input.annotations import (
 from s4a.input.landmarks import locate
 from s4a.schema import dataset
 from s4a.study import quality_control
+from s4a.study.pair import pair_study
 
 OPTIONS = {"n_coarse": 1200, "k": 60}
 
@@ -156,6 +157,31 @@ def test_a_shape_gives_its_labels_through_the_template_to_the_others(study, mesh
         assert (node["label"].values == meshes[name]["label"].values).mean() > 0.93
         assert node["label_vote"].sum("label_value").values == pytest.approx(1, abs=1e-4)
         assert node["label_value"].values.tolist() == np.unique(label).tolist()
+
+
+def test_several_sources_are_averaged_and_have_equal_votes(study, meshes):
+    names = "brain_02", "brain_03"
+    labels = {n: meshes[n]["label"].values for n in names}
+    marks = {n: meshes[n][["landmark_name", "landmark_position"]] for n in names}
+    one, two = ({"label": [], "mark": []} for _ in range(2))
+    for given, found in (({names[0]}, one), (set(names), two)):
+        few = {n: labels[n] for n in names if n in given}
+        label = transfer_labels(study, few, targets=["brain_01"])["brain_01"]
+        found["label"] = (label["label"].values == meshes["brain_01"]["label"].values).mean()
+        few = {n: marks[n].isel(landmark=slice(None, None, -1)) for n in names[:1]}
+        few |= {n: marks[n] for n in names[1:] if n in given}
+        found["mark"] = transfer_landmarks(study, few, targets=["brain_01"])["brain_01"]
+    true = meshes["brain_01"]["landmark_position"].values[::-1]
+    errors = [distance(f["mark"]["landmark_position"].values, true).mean() for f in (one, two)]
+    assert errors[1] < errors[0]
+    assert two["label"] > one["label"]
+    assert (two["mark"]["landmark_disagreement"] > 0).all()
+    rest = transfer_labels(study, {n: labels[n] for n in names})
+    assert list(rest.children) == ["brain_01"]
+    with pytest.raises(ValueError, match="replaces source="):
+        transfer_labels(study, labels, source="brain_01")
+    with pytest.raises(ValueError, match="the same landmarks"):
+        transfer_landmarks(study, marks | {names[1]: marks[names[1]].isel(landmark=slice(3))})
 
 
 def test_named_labels_travel_too(study, meshes):
@@ -360,6 +386,7 @@ def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
     np.save(tmp_path / "half.npy", np.array([0.5, 1]))
     np.savez(tmp_path / "two.npz", p=np.arange(4), q=np.arange(4))
     (tmp_path / "a.csv").write_text("p,q\n1,2\n")
+    (tmp_path / "twice.csv").write_text("label,label\n1,2\n")
     (tmp_path / "lh.label").write_text("#!ascii label  , from subject\n1\n99 1 2 3 0\n")
     for name, n, text in (
         ("lh.label", 5, "one label for every vertex expected, found some vertices"),
@@ -371,7 +398,8 @@ def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
             r"one array of 4 values needed, found p \(4,\), q \(4,\); name it as two.npz:NAME",
         ),
         ("two.npz:r", 4, "array .r. needed, found p, q"),
-        ("a.csv", 1, "a column 'label' needed, found p, q"),
+        ("a.csv", 1, "one column 'label' needed, found p, q"),
+        ("twice.csv", 1, "one column 'label' needed, found label, label"),
         ("none.npy", 1, "no file .*none.npy"),
     ):
         with pytest.raises(ValueError, match=text):

@@ -275,6 +275,12 @@ def test_flags_and_their_help_follow_from_a_function():
     assert "Twice." in said
     assert "N what is doubled" in said
     assert "how often (default: 2)" in said
+    with pytest.raises(ValueError, match=r"options of s4a.Options.* expected; found \['sede'\]"):
+        cli.command(double, ("k", "sede"))
+    double.__annotations__ = dict.fromkeys(double.__annotations__, "bool")  # as by __future__
+    given = {}
+    cli.command(double).flags(lambda *names, **settings: given.update({names[-1]: settings}))
+    assert given["--minus"]["action"] == "store_true"
 
 
 def test_demo_finds_the_simulated_modes_and_writes_its_page(tmp_path, monkeypatch, capsys):

@@ -15,6 +15,7 @@ from paths import DOCS
 
 from faults.shapes import FAULTS, make
 from s4a import read_shapes
+from s4a.input.formats import FORMATS
 
 PAGE = DOCS / "faults.md"
 HEAD = """# Faulty input: meshes, tables, options and studies
@@ -60,7 +61,8 @@ def sentences(report):
             lines = [line for line in lines if fault.file in line]
         else:
             lines = report[fault.where].sel(shape=fault.shape).item().splitlines()
-        texts[fault.shape] = re.sub(r"\S*/(?=[^/\s]+)", "", " ".join(lines))
+        text = re.sub(r"\S*/(?=[^/\s]+)", "", " ".join(lines))
+        texts[fault.shape] = text.replace(", ".join(FORMATS), "PLY, OBJ, ...")
     return texts
 
 

@@ -43,6 +43,7 @@ def test_other_codes_and_outliers_are_named_with_the_values_of_the_others(caplog
     found = findings(with_value(290), caplog)
     assert "outliers, 290 of s3 (others 20 to 54): correct the value, or write NA" in found
     assert "outliers, -31 of s3" in findings(with_value(-31), caplog)
+    assert "outliers, 3.1 of s3" in findings(with_value(3.1), caplog)
     mixed = np.where(np.arange(12) % 2, 1.5 + 0.03 * np.arange(12), 150 + 3 * np.arange(12))
     assert "values of two sizes, 1.53 to 1.83 and 150 to 180: are all in one unit?" in findings(
         mixed, caplog
@@ -69,6 +70,7 @@ def test_clean_columns_are_not_reported(caplog):
             *(rng.integers(0, 2, n), rng.random(n) < 0.1, rng.integers(1, 5, n)),
             *(rng.lognormal(8, 0.6, n), rng.normal(size=n), rng.poisson(1.5, n)),
             rng.normal(0, 5, 20 * n).round(),
+            with_value(31.5, values=adults),
             *(rng.choice([-1, 1], n), np.arange(n), 1000 + rng.permutation(n), np.full(n, 9.0)),
             *([-999.0] * n, with_value(np.nan, values=adults)),
             # zeros among doses, visits, counts; 0, 100 and 200

@@ -2,6 +2,7 @@
 
 import zlib
 from base64 import b64encode
+from pathlib import Path
 
 import nibabel as nib
 import numpy as np
@@ -18,6 +19,7 @@ from s4a.input.formats import vtk_bytes, vtp_bytes
 from s4a.input.landmarks import locate
 from s4a.input.raw import sentences
 from s4a.schema import dataset, in_unit
+from s4a.study.pair import pair_study
 
 X, T = as_arrays(s4a.synthetic.sphere(200))
 X = (X + 0.3 * np.exp(X * [1, -1, 1])) * [9, 6, 4]  # without symmetry
@@ -86,6 +88,7 @@ def test_every_format_says_its_coordinate_system(tmp_path):
         gifti(tmp_path / "b.gii", (1, 1)): "scanner RAS",
         gifti(tmp_path / "c.gii", (2, 4)): "RAS",
         gifti(tmp_path / "d.gii", (4, 4)): "MNI152 RAS",
+        gifti(tmp_path / "k.gii", (3, 3), **axes): "RAS, origin unknown",  # of Workbench
         gifti(tmp_path / "e.gii", (0, 1), moved): surface,
         gifti(tmp_path / "f.gii", (0, 3), **axes): surface,
         gifti(tmp_path / "h.gii", (0, 1), moved, **axes): surface,
@@ -122,6 +125,27 @@ def test_every_format_says_its_coordinate_system(tmp_path):
     assert read_mesh(tmp_path / "g.gii")[2]["coordinate_system"] == "RAS, origin unknown"
     with pytest.raises(ValueError, match=r"one set of points .* found 2 and 1: save each surface"):
         read_mesh(gifti(tmp_path / "two.gii", sets=2))
+    metres = np.diag([1000, 1000, 1000, 1.0]) @ moved
+    attrs = read_mesh(gifti(tmp_path / "m.gii", (0, 1), metres))[2]
+    assert transform(CoordinateSystem.of(attrs), system("RAS")) == pytest.approx(metres)
+    assert attrs["unit"] == "m"
+
+
+def test_a_file_that_states_two_coordinate_systems_is_refused(tmp_path):
+    field = b"POLYDATA\nFIELD FieldData 1\nSPACE 1 1 string\n\xc3LPS\n"
+    data = vtk_bytes(X, T, {}, LIKE_SLICER.format("%s")).replace(b"POLYDATA\n", field, 1)
+    files = {
+        "a.vtk": data.replace(b"%s", b"RAS"),
+        "a.vtp": vtp("ascii").replace(b"<VTKFile", b"<!-- SPACE=RAS --><VTKFile"),
+        "a.csv": b"# SPACE=RAS\nname,l,p,s\na,1,2,3\n",
+        "b.csv": b"coordinate_system,x,y,z\nRAS,1,2,3\nLPS,1,2,3\n",
+    }
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=r"one (SPACE|coordinate system) .* LPS and RAS"):
+            (read_landmarks if "csv" in name else read_mesh)(tmp_path / name)
+    (tmp_path / "a.vtk").write_bytes(data.replace(b"%s", b"LPS"))
+    assert read_mesh(tmp_path / "a.vtk")[2]["coordinate_system"] == "LPS"
 
 
 def test_surface_ras_becomes_scanner_ras_for_any_direction_of_the_voxels(tmp_path):
@@ -192,6 +216,8 @@ def test_a_collection_is_converted_or_told_what_is_missing(tmp_path):
     write_mesh(tmp_path / "s2.ply", X, T)
     with pytest.raises(ValueError, match=r"RAS, mm: s0, s1; unknown: s2: set coordinate_system="):
         s4a.analyse(meshes | {"s2": tmp_path / "s2.ply"})
+    with pytest.raises(ValueError, match="RAS, mm: source; unknown: target: set coordinate_system"):
+        s4a.match_pair(meshes["s0"], tmp_path / "s2.ply")
     with pytest.raises(ValueError, match="unit must be one of um, mm, cm, m, in; found 'inch'"):
         s4a.analyse(meshes, unit="inch")
 
@@ -212,6 +238,25 @@ def test_a_study_of_files_in_two_systems_is_that_of_files_in_one(tmp_path):
     assert score[0] == pytest.approx(score[1], abs=1e-9)
     assert "1 of 3 shapes were converted to RAS: brain_03 (LPS)" in remarks[1]
     assert "converted" not in remarks[0]
+    labels = []
+    for text, flip in (("RAS", [1, 1, 1]), ("LAS", [-1, 1, 1])):  # an external source
+        mesh = brains["brain_02"].to_dataset()
+        turned = mesh["corner_vertex"].values[:, :: 1 if text == "RAS" else -1]
+        source = as_dataset(mesh["position"].values * flip, turned, system(text, "").attrs)
+        found = s4a.transfer_labels(study, mesh["label"].values, source=source)
+        labels.append(found["brain_01/label"].values)
+    assert (labels[0] == labels[1]).all()
+
+
+def test_a_pair_and_its_study_have_one_coordinate_system():
+    ras = as_dataset(X, T, system("RAS").attrs)
+    lps = as_dataset(X * [-1, -1, 1], T, system("LPS").attrs)
+    result = s4a.match_pair(ras, lps, n_coarse=100, k=10, k_init=6)
+    found = s4a.correspondence(pair_study(result, ras, lps), "source", "target")
+    assert found["image_position"].values == pytest.approx(X, abs=1e-6)
+    las = as_dataset(X * [-1, 1, 1], T[:, ::-1], system("LAS").attrs)
+    table = s4a.compare(ras, las, methods=["kNN"], n_coarse=100, k=10, k_init=6)
+    assert table["chamfer"].item() == pytest.approx(0, abs=1e-9)
 
 
 def test_landmarks_lie_on_the_surface_whatever_the_two_files_say(tmp_path):
@@ -248,7 +293,7 @@ def test_landmarks_that_fit_a_mesh_in_two_directions_are_reported(caplog):
     assert not caplog.text
 
 
-def test_landmark_files_of_other_programs_are_read(tmp_path):
+def test_landmark_files_of_other_programs_are_read(tmp_path, caplog):
     P, names = np.array([[1.5, 2, 3], [-4, 5.25, 6]]), ["a", "b"]
     rows = list(zip(range(2), *P.T.tolist(), names, strict=True))
     fcsv = "".join(FCSV.format(*row) for row in rows)
@@ -258,13 +303,21 @@ def test_landmark_files_of_other_programs_are_read(tmp_path):
     files = {
         "lps.fcsv": (f"{HEAD}# CoordinateSystem = LPS\n{COLUMNS}{fcsv}", "LPS", names),
         "one.fcsv": (f"{HEAD}# CoordinateSystem = 1\n{COLUMNS}{fcsv}", "LPS", names),
-        "five.fcsv": (  # of 3D Slicer 5: 2 for a position, 0 for none
+        "five.fcsv": (  # of 3D Slicer 5: 2 for a position, 0, 1 and 3 for none
             HEAD + "# CoordinateSystem = LPS\n" + COLUMNS + fcsv.replace("\n", ",2,0\n")
-            + FCSV.format(3, 0, 0, 0, "c").replace("\n", ",0,0\n"), "LPS", names),
+            + "".join(FCSV.format(i, 0, 0, 0, "c").replace("\n", f",{i},0\n") for i in (0, 1, 3)),
+            "LPS", names),
         "stated.csv": (f"# SPACE=LPS UNIT=mm\nlabel,x,y,z,defined,selected\n{csv}", "LPS", names),
         "units.mrk.json": (MARKUPS % ('"1", "coordinateUnits": ["mm", "UCUM", "millimeter"]',
             ", ".join(f'{{"label": "{n}", "position": {p}}}'
                       for n, p in zip(names, P.tolist(), strict=True))), "LPS", names),
+        "set.json": (MARKUPS % ('"LPS"', ", ".join(
+            f'{{"position": {p}, "positionStatus": "{s}"}}' for s, p in (
+                ("preview", [0] * 3), ("defined", P[0].tolist()),
+                ("missing", [0] * 3), ("defined", P[1].tolist())))), "LPS", ["2", "4"]),
+        "index.csv": (",x,y,z\na,1.5,2,3\nb,-4,5.25,6\n", "", names),
+        "unit.csv": ("name,x,y,z,unit,coordinate_system\na,1.5,2,3,mm,LPS\nb,-4,5.25,6,,\n",
+                     "LPS", names),
         "old.fcsv": (f"{HEAD}# CoordinateSystem = 0\n{COLUMNS}{fcsv}", "RAS", names),
         "lps.csv": (f"label,l,p,s,defined,selected\n{csv}c,0,0,0,0,1\n", "LPS", names),
         "ras.csv": (f"label,r,a,s,defined,selected\n{csv}", "RAS", names),
@@ -283,6 +336,9 @@ def test_landmark_files_of_other_programs_are_read(tmp_path):
         assert found["landmark_position"].values == pytest.approx(P), name
         assert found["landmark_name"].values.tolist() == expected, name
         assert found.attrs == (system(axes).attrs if axes else {}), name
+    left_out = [record.getMessage().rpartition(": ")[::2] for record in caplog.records]
+    assert [(Path(text.partition(":")[0]).name, names) for text, names in left_out] == [
+        ("five.fcsv", "c, c, c"), ("set.json", "1, 3"), ("lps.csv", "c")]  # fmt: skip
     wrong = {
         "two.tps": "one specimen needed, found x, y: choose one as FILE.tps:x",
         "a.tps": "2 points needed, found 1",
@@ -295,8 +351,10 @@ def test_landmark_files_of_other_programs_are_read(tmp_path):
     point = '{"position": [1, 2, 3], "coordinateSystem": "RAS"}'
     (tmp_path / "a.mrk.json").write_text(MARKUPS % ('"LPS"', point))
     (tmp_path / "b.json").write_text("{}")
+    (tmp_path / "twice.csv").write_text("name,x,y,z,x,y,z\na,1,2,3,4,5,6\n")
     wrong["b.json"] = "'markups' expected, found none"
-    wrong["a.mrk.json"] = "one coordinateSystem, LPS or RAS, needed, found LPS, RAS"
+    wrong["twice.csv"] = "the columns name, x, y and z needed, found name, x, y, z, x, y, z"
+    wrong["a.mrk.json"] = "one coordinate system expected, found LPS and RAS"
     for name, words in wrong.items():
         with pytest.raises(ValueError, match=words):
             read_landmarks(tmp_path / name)
@@ -357,8 +415,9 @@ def test_the_command_prints_the_system_of_each_file(tmp_path, capsys):
     write_mesh(tmp_path / "c.ply", X, T)
     from s4a.cli import main
 
-    assert main(["check", str(tmp_path)]) == 0
-    out = capsys.readouterr().out
+    assert main(["check", str(tmp_path)]) == 2  # as a run
+    out, error = capsys.readouterr()
+    assert "set --coordinate-system and --unit for files that lack them" in error
     assert "surface RAS, c_ras 12 -20 35, mm" in out
     assert "LPS, mm" in out
     assert "needed, found" in " ".join(out.split())

@@ -288,6 +288,8 @@ def test_a_wrong_registration_is_flagged():
     assert "wrong (score 0.100" in wrong["c"][0].words
     assert remarks == []
     assert flagged({"a": 0.0, "b": 0.12, "c": 0.1})[0] == {}
+    coarse = dict.fromkeys("abc", 300)  # below twice the vertex spacing
+    assert flagged({"a": 0.0, "b": 0.02, "c": 0.1}, n=coarse) == ({}, [])
 
 
 def test_two_shapes_share_the_median_with_a_remark():

@@ -333,11 +333,12 @@ def test_one_command_leads_from_volumes_to_modes_and_resumes_and_inserts(volumes
     assert cli.main(["insert", *into, "--coordinate-system", "RAS", "--unit", "mm"]) == 0
     Y, S = mesh
     half = S[Y[S][:, :, 0].min(1) > Y[:, 0].mean() - 4]
-    s4a.write_mesh(tmp_path / "half.ply", Y, half)
+    s4a.write_mesh(tmp_path / "half.ply", Y, half, coordinate_system="RAS", unit="mm")
     part = [str(out), str(tmp_path / "half.ply"), "--samples", "0", "--out", str(tmp_path / "h")]
     assert cli.main(["complete", *part]) == 0
     np.save(tmp_path / "labels.npy", (Y[:, 0] > Y[:, 0].mean()).astype(int))
     labels = ["--labels", str(tmp_path / "labels.npy"), "--out", str(tmp_path / "carried")]
+    labels += ["--coordinate-system", "RAS", "--unit", "mm"]
     assert cli.main(["transfer", str(tmp_path / "a mesh.ply"), str(out), *labels]) == 0
     carried = np.load(tmp_path / "carried" / "scan_2.labels.npy")
     assert len(carried) == len(read_volume(volumes / "scan_2.nii.gz", 17)[0])

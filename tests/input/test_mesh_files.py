@@ -5,9 +5,18 @@ import fuzz
 import nibabel
 import numpy as np
 import pytest
-from paths import DATA
+from paths import DATA, DOCS
 
-from s4a.input.files import find_meshes, not_meshes, read_mesh, slug, write_mesh
+from s4a.input.files import (
+    WITH_VALUES,
+    WRITERS,
+    find_meshes,
+    not_meshes,
+    read_mesh,
+    slug,
+    write_mesh,
+)
+from s4a.input.formats import FORMATS
 from s4a.input.polygons import triangulated
 
 X = np.array([[0, 0, 0], [1.5, 0, 0], [1.5, 2, 0], [0, 2, 0], [0.25, 0.5, 3]])
@@ -28,7 +37,7 @@ def file(tmp_path, name, content):
     return path
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl", ".vtk", ".gii", ".npz"])
+@pytest.mark.parametrize("suffix", WRITERS)
 def test_a_written_mesh_comes_back(tmp_path, suffix):
     write_mesh(tmp_path / f"m{suffix}", X, T)
     same_surface(tmp_path / f"m{suffix}")
@@ -43,9 +52,9 @@ def test_text_formats_keep_every_digit(tmp_path):
 
 def test_scalars_are_written_where_the_format_holds_them(tmp_path):
     height = X[:, 2]
-    for name in ("m.ply", "m.vtk", "m.gii", "m.npz"):
-        write_mesh(tmp_path / name, X, T, height=height)
-        same_surface(tmp_path / name)
+    for suffix in WITH_VALUES:
+        write_mesh(tmp_path / f"m{suffix}", X, T, height=height)
+        same_surface(tmp_path / f"m{suffix}")
     np.testing.assert_array_equal(nibabel.load(tmp_path / "m.gii").darrays[2].data, height)
     with np.load(tmp_path / "m.npz") as arrays:
         np.testing.assert_array_equal(arrays["height"], height)
@@ -258,6 +267,16 @@ MESHES = [name for name, (_, kind, _) in SEEDS.items() if kind == "mesh" and nam
 def wholes(name):
     """Valid files of a format, from which damaged ones are made."""
     return [finish(content) for content, finish in SEEDS[name][2] if finish is fuzz.whole]
+
+
+def test_every_format_is_documented_and_has_damaged_files():
+    assert set(FORMATS) <= set(SEEDS)
+    table = (DOCS / "formats.md").read_text(encoding="utf-8").split("\n## ")[1]
+    rows = [line.split(" | ") for line in table.splitlines() if "`." in line]
+    documented = [(row[1].split("`")[1], row[3][:3] == "yes", "yes" in row[4]) for row in rows]
+    formats = FORMATS.values()
+    declared = [(kind.suffixes.split()[0], bool(kind.write), kind.scalars) for kind in formats]
+    assert sorted(documented) == sorted(declared)
 
 
 @pytest.mark.parametrize("name", MESHES)

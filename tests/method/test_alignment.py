@@ -46,6 +46,12 @@ def test_nearly_symmetric_shapes_are_ambiguous_and_others_are_not():
         assert np.trace(aligned.R.T @ true) > 2.9
 
 
+def test_of_equally_good_poses_that_of_the_files_is_used():
+    for aligned in align_all({f"s{i}": basis(*rod(i, bump=0.1)) for i in range(6)}, "s0").values():
+        assert aligned.ambiguity
+        assert np.trace(aligned.R) > 2.9
+
+
 def test_shapes_vote_on_a_pose_that_the_reference_leaves_open():
     target, shape = (basis(*rod(i, end=end)) for i, end in ((0, 0.0), (1, 0.6)))
     shape = basis(shape.X @ np.diag([-1.0, 1.0, -1.0]), shape.T)

@@ -11,7 +11,7 @@ from paths import NOTEBOOKS, benchmark
 axe = pytest.importorskip("axe_playwright_python.sync_playwright")
 chromium = benchmark("chromium")
 needed = pytest.mark.skipif(chromium.PATH is None, reason=chromium.LACKS)
-# JupyterLab's own; the last where cells run while its widget manager asks the kernel for all widgets
+# JupyterLab's own; the last where cells run while its widget manager asks for all widgets
 HARMLESS = ("t.on is not a function", "Unsatisfied version", "widget model not found")
 READY = """[...window.jupyterapp.shell.widgets("main")].some(
     (w) => "jupyter.widget" in (w.sessionContext?.session?.kernel?._targetRegistry ?? {}))"""

@@ -852,7 +852,7 @@ def test_a_shape_is_chosen_in_all_tabs(study):
     tabs.close()
 
 
-def test_the_tabs_of_an_unfinished_study_show_what_is_missing(study):
+def test_the_tabs_of_an_unfinished_study_show_what_is_missing(study, monkeypatch):
     started = xr.DataTree.from_dict(
         {f"coarse/{n}": c.to_dataset() for n, c in study["coarse"].children.items()}
     )
@@ -865,6 +865,12 @@ def test_the_tabs_of_an_unfinished_study_show_what_is_missing(study):
         tabs["Modes"]
     with pytest.raises(ValueError, match=r"no tab 'Mode'; there are Modes, Network"):
         tabs["Mode"]
+    table = type("Table", (s4a.widgets.Panel,), {"needs": ("subjects",)})
+    monkeypatch.setitem(explore_module.PANELS, "Table", table)
+    with pytest.raises(ValueError, match=r"no tab 'Table', as the study lacks subjects;"):
+        tabs["Table"]
+    started["subjects"] = xr.Dataset({"age": ("shape", [31.0])})
+    assert "Table" in explore_module.kinds_of(started)
     tabs.refresh(study)
     assert tabs["Modes"].scores == [0.0] * 3
     tabs.close()
