@@ -6,7 +6,8 @@ pyFM is on PyPI as ``pyfmaps`` (the extra ``bench``).  ``speed.py stages``, ``pi
 ``growth``, ``pairs``, ``nearest``, or ``write`` runs one part, ``speed.py methods brains
 faces heads`` an analysis by RE-MATCH and by SCALABLE of ten shapes of each, ``speed.py whole 51
 100000`` the whole analysis of so many synthetic shapes of so many vertices, ``speed.py versions 51
-100000`` the same by an older version and by this one, three times in turn.
+100000`` the same by an older version and by this one, three times in turn, ``speed.py sizes`` pairs
+of 10,000 to 3.5 million vertices, or of those that are named.
 """
 
 import io
@@ -14,6 +15,7 @@ import itertools
 import json
 import multiprocessing
 import os
+import pickle
 import resource
 import shutil
 import subprocess
@@ -826,6 +828,32 @@ def error_of(images, template, area, truth):
     return 100 * float(np.mean(gaps / np.sqrt([area[name] for name in names])))
 
 
+def write_pair(n_vertices, path):
+    """Two synthetic brains in one file, with the true image of every vertex of the second."""
+    tree = synthetic.brains(2, n_vertices)
+    meshes = [tree["original"][name].to_dataset() for name in ("brain_01", "brain_02")]
+    at = tree["truth"]["brain_02"]["reference_point"].values
+    path.write_bytes(pickle.dumps((*meshes, synthetic.position(tree["truth"], "brain_01", at))))
+
+
+def matched_pair(path):
+    """Match the pair of a file; return the mean error of the surface in % of sqrt(area)."""
+    source, target, true = pickle.loads(path.read_bytes())
+    found = s4a.match_pair(source, target)
+    moved = target["position"].values + found["displacement"].values - found["translation"].values
+    gap = np.linalg.norm(moved @ found["rotation"].values / found["scale"].item() - true, axis=1)
+    return 100 * gap.mean() / np.sqrt(triangle_areas(*as_arrays(source)).sum())
+
+
+def sizes(folder, *numbers):
+    """Seconds, memory and error of s4a.match_pair by the vertices of both meshes, in memory."""
+    say(f"\n| vertices | CPU s | wall s | MiB | error, % |\n|{' --- |' * 5}")
+    for n in numbers or (10_000, 30_000, 100_000, 300_000, 1_000_000, 3_500_000):
+        measured(write_pair, n, folder / "pair")  # in a process of its own
+        error, cpu, wall, memory = measured(matched_pair, folder / "pair")
+        say(f"| {n:,} | {cpu:.1f} | {wall:.1f} | {memory:.0f} | {error:.3f} |")
+
+
 def cpu_of(function, times=20):
     """Milliseconds of CPU of a call, the least of five."""
     spent = []
@@ -862,6 +890,7 @@ PARTS = {
     "methods": methods,
     "whole": whole,
     "versions": versions,
+    "sizes": sizes,
 }
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
 # weight of normals once surfaces coincide: enough to find the right side of a thin wall, while the
 # noise of a scan's normals, 0.1 and more, weighs less than several edges at 100,000 vertices
 _CLOSE_WEIGHT = 0.05
+_AT_ONCE = 4096  # points whose triangles are searched at once, in the cache
 _FLAT = 1e-14  # squared sine of the angle at A below which a triangle is degenerate
 
 
@@ -187,20 +188,30 @@ def closest_point_on_triangles(P: Array, A: Array, B: Array, C: Array) -> Array:
     ----------
     C. Ericson (2005), Real-Time Collision Detection, section 5.1.5.
     """
-    v, w = _closest_by_sides(B - A, C - A, P - A)
+    v, w, _ = _closest_by_sides((B - A).T, (C - A).T, (P - A).T)
     return np.stack([np.maximum(1 - v - w, 0), v, w], axis=1)
 
 
 def _closest_by_sides(ab, ac, ap):
-    """Weights ``(n,)`` of B and C in the closest point of :func:`closest_point_on_triangles`.
+    """Weights of B and C in the closest point of :func:`closest_point_on_triangles`.
 
     Parameters
     ----------
-    ab, ac, ap : float ndarray (n, d)
-        From A to B, to C and to the point.
+    ab, ac, ap : float ndarray (d, n)
+        From A to B, to C and to the point, as columns: sums over d are then sums of rows.
+
+    Returns
+    -------
+    v, w : float ndarray (n,)
+    distance2 : float ndarray (n,)
+        Squared distance of the closest point, less that of A.
     """
-    d1, d2 = dots(ab, ap), dots(ac, ap)
-    ab_ac, ab_ab, ac_ac = dots(ab, ac), dots(ab, ab), dots(ac, ac)
+
+    def products(a, b):
+        return np.einsum("ij,ij->j", a, b)
+
+    d1, d2 = products(ab, ap), products(ac, ap)
+    ab_ac, ab_ab, ac_ac = products(ab, ac), products(ab, ab), products(ac, ac)
     d3, d4 = d1 - ab_ab, d2 - ab_ac  # products of ab and ac with the vector from B
     d5, d6 = d1 - ab_ac, d2 - ac_ac  # and from C
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
@@ -224,8 +235,9 @@ def _closest_by_sides(ab, ac, ap):
         v, w = np.where(region, at_b, v), np.where(region, at_c, w)
     flat = np.flatnonzero(ab_ac * ab_ac >= (1 - _FLAT) * ab_ab * ac_ac)
     if len(flat):  # the signs are those of rounding errors there
-        v[flat], w[flat] = _closest_on_sides(ab[flat], ac[flat], ap[flat])
-    return v, w
+        v[flat], w[flat] = _closest_on_sides(ab[:, flat].T, ac[:, flat].T, ap[:, flat].T)
+    distance2 = v * (v * ab_ab + 2 * (w * ab_ac - d1)) + w * (w * ac_ac - 2 * d2)
+    return v, w, distance2
 
 
 def _closest_on_sides(ab, ac, ap):
@@ -250,14 +262,20 @@ def dots(a: Array, b: Array) -> Array:
 
 
 class Stars(NamedTuple):
-    """Triangles around every vertex.
+    """Triangles around every vertex, by their corners at it.
 
-    Those of v are ``triangle[start[v] : start[v] + degree[v]]``.
+    Those of v are ``corner[start[v] : start[v] + degree[v]]``.
     """
 
-    triangle: Array  # (3 m,)
+    corner: Array  # (3 m,): 3 t + c for corner c of triangle t
+    following: tuple[Array, Array]  # (3 m,) each: vertices of the two corners after it
     start: Array  # (n,)
     degree: Array  # (n,)
+
+    @property
+    def triangle(self) -> Array:
+        """The triangles ``(3 m,)``."""
+        return self.corner // 3
 
 
 def stars(T: Array, n: int) -> Stars:
@@ -271,9 +289,10 @@ def stars(T: Array, n: int) -> Stars:
     >>> around.degree.tolist(), around.triangle[around.start[3] :].tolist()
     ([1, 2, 2, 1], [1])
     """
-    order = counting_order(T.ravel(), n)
+    corner = counting_order(T.ravel(), n)
+    b, c = (np.roll(T, shift, axis=1).ravel().take(corner) for shift in (-1, -2))
     degree = np.bincount(T.ravel(), minlength=n)
-    return Stars(order // 3, np.cumsum(degree) - degree, degree)
+    return Stars(corner, (b, c), np.cumsum(degree) - degree, degree)
 
 
 def closest_point_in_star(
@@ -299,33 +318,31 @@ def closest_point_in_star(
     weights : float ndarray (p, 3)
         Barycentric, non-negative, rows sum to 1.
     """
-    star, start, degree = around or stars(T, len(X))
+    corner, following, start, degree = around or stars(T, len(X))
     triangle, weights = np.empty(len(P), np.int64), np.empty((len(P), 3))
-    for block in np.array_split(np.arange(len(P)), max(1, len(P) // 50_000)):
-        repeat = degree[nearest[block]]
+    for begin in range(0, len(P), _AT_ONCE):
+        block = slice(begin, begin + _AT_ONCE)
+        vertex = nearest[block]
+        repeat = degree.take(vertex)
         if (repeat == 0).any():
             raise ValueError(
                 "closest_point_in_star needs vertices with triangles; found an isolated one"
             )
         first = np.cumsum(repeat) - repeat
-        row = np.repeat(np.arange(len(block)), repeat)
-        candidate = star[start[nearest[block]][row] + np.arange(len(row)) - first[row]]
-        # take is five times faster than fancy indexing
-        A, ab, ac = (X.take(corner, axis=0) for corner in T.take(candidate, axis=0).T)
-        ap = P.take(block[row], axis=0)
-        for side in (ab, ac, ap):  # in place, as below: copies cost as much as the products
-            side -= A
-        v, w = _closest_by_sides(ab, ac, ap)
-        ab *= v[:, None]
-        ac *= w[:, None]
-        offset = ab
-        offset += ac
-        offset -= ap
-        distance2 = dots(offset, offset)
+        row = np.repeat(np.arange(len(vertex)), repeat)
+        candidate = np.arange(len(row)) + (start.take(vertex) - first).take(row)
+        A = X.take(vertex, axis=0)
+        a, ap = (values.T.take(row, axis=1) for values in (A, P[block] - A))  # (d, candidates)
+        ab, ac = (
+            np.ascontiguousarray(X.take(end.take(candidate), axis=0).T) - a for end in following
+        )
+        v, w, distance2 = _closest_by_sides(ab, ac, ap)
         best = np.minimum.reduceat(distance2, first)
-        is_best = np.flatnonzero(distance2 == best[row])
-        pick = is_best[np.searchsorted(row[is_best], np.arange(len(block)))]  # the first of a row
-        v, w = v[pick], w[pick]
-        triangle[block] = candidate[pick]
-        weights[block] = np.stack([np.maximum(1 - v - w, 0), v, w], axis=1)
+        is_best = np.flatnonzero(distance2 == best.take(row))
+        pick = is_best[np.searchsorted(is_best, first)]  # the first of a row
+        triangle[block], c = np.divmod(corner.take(candidate.take(pick)), 3)
+        v, w = v.take(pick), w.take(pick)
+        ordered = (np.arange(3) - c[:, None]) % 3  # corners of the triangle among A, B, C
+        shares = np.stack([np.maximum(1 - v - w, 0), v, w], axis=1)
+        weights[block] = np.take_along_axis(shares, ordered, axis=1)
     return triangle, weights

@@ -167,7 +167,7 @@ def boundary_attraction(
     y : float ndarray (r, 3)
         The nearest vertices of the source's boundary.
     """
-    if not (len(source.boundary) and len(target.boundary)):
+    if not (len(target.boundary) and len(source.boundary)):  # the template's is kept
         return None
     start, end = target.boundary.T
     vertex = np.unique(target.boundary)

@@ -215,13 +215,14 @@ def refine_at_full_resolution(
     C : float ndarray (k_target, k_source)
     """
     k_target, k_source = C.shape
-    if B is None:
-        Phi = source.low.Phi[:, :k_source]
-        B = source.U.astype(np.float32) @ Phi.astype(np.float32)
-    B = B[:, :k_source]
-    Psi = target.low.Phi[:, :k_target]
-    match = nearest_of_few(Psi, B @ C.T.astype(B.dtype), source.cell)
-    return fmap_from_match(B, Psi, target.low.mass, match)
+    Phi, Psi = source.low.Phi[:, :k_source], target.low.Phi[:, :k_target]
+    if B is None:  # U Phi is not formed: 0.4 GB for a million vertices
+        match = nearest_of_few(Psi, source.full.extend(Phi @ C.T), source.cell)
+        matched = source.U[match] @ Phi
+    else:
+        match = nearest_of_few(Psi, B[:, :k_source] @ C.T.astype(B.dtype), source.cell)
+        matched = B[match, :k_source]
+    return fmap_from_match(matched, Psi, target.low.mass, np.arange(len(match)))
 
 
 def from_latent(
