@@ -10,11 +10,11 @@ from scipy.spatial.distance import cdist
 from small import FLAGS, OPTIONS
 
 import s4a
-from s4a.analysis import transfer
 from s4a.cli import main
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
 from s4a.options import DECLARED, PRESETS, Options, with_options
+from s4a.study import pair
 
 PAPER, FAST = PRESETS["paper"], PRESETS["fast"]
 DEFAULTS = {name: PRESETS[None][name] for name in PAPER}
@@ -172,13 +172,13 @@ def test_a_new_shape_is_cleaned_and_registered_by_the_options_of_the_study(paper
 def calls(monkeypatch):
     """The options by which a transfer matches pairs, one after the other."""
     options = []
-    match = transfer.match_shapes
+    match = pair.match_shapes
 
     def watched(source, target, given):
         options.append(given)
         return match(source, target, given)
 
-    monkeypatch.setattr(transfer, "match_shapes", watched)
+    monkeypatch.setattr(pair, "match_shapes", watched)
     return options
 
 
