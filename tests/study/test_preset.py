@@ -10,6 +10,7 @@ from scipy.spatial.distance import cdist
 from small import FLAGS, OPTIONS
 
 import s4a
+from s4a.analysis import transfer
 from s4a.cli import main
 from s4a.geometry.closest import closest_point, interpolate
 from s4a.geometry.mesh import as_arrays
@@ -319,9 +320,10 @@ def test_the_commands_take_the_preset_between_files_and_to_a_study(
     to = ["transfer", source, "--labels", str(labels), "--out", str(tmp_path)]
     assert main([*to[:2], target, *to[2:], "--preset", "paper", *FLAGS]) == 0
     assert (calls[0].preset, calls[0].k) == ("paper", OPTIONS["k"])
-    assert main([*to[:2], str(paper), *to[2:], "--k", "20", "--preset", "paper"]) == 0
+    into = [*to[:2], str(paper), *to[2:], "--coordinate-system", "RAS", "--unit", "mm"]
+    assert main([*into, "--k", "20", "--preset", "paper"]) == 0
     assert (calls[1].preset, calls[1].k) == ("paper", 20)
-    assert main([*to[:2], str(paper), *to[2:], "--full-resolution-iterations", "1"]) == 2
+    assert main([*into, "--full-resolution-iterations", "1"]) == 2
     assert "preset 'paper' sets --full-resolution-iterations 0; found" in capsys.readouterr().err
     assert (
         main([*to[:2], target, *to[2:], "--preset", "paper", "--full-resolution-iterations", "1"])
