@@ -161,7 +161,7 @@ def test_an_error_of_one_match_is_measured_by_the_other_path(study):
     assert right < 0.2 * turned
     assert between_paths(path_differences(model_of(wrong))) == pytest.approx(turned, rel=0.15)
     alike, _ = slid(study, others)
-    assert between_paths(path_differences(model_of(alike))) < 0.4 * turned
+    assert between_paths(path_differences(model_of(alike))) < 0.5 * turned
 
 
 def test_a_shape_excluded_from_the_network_is_not_registered_to_others(study):
