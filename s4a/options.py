@@ -372,9 +372,8 @@ class Options:
         of="initial maps", given_as="never".__ne__, pair=True,
         more="The iteration does not change the size of the map.  Single pairs are matched by "
         ":func:`s4a.match_pair` (4.1)")
-    step: int = network(8, "eigenfunctions added in each iteration of ZoomOut", least=1, paper=5,
-        section="4.2", instead="no number; 5 as in pyFM", see="method/latent",
-        of="Consistent ZoomOut", pair=True)
+    step: int = network(5, "eigenfunctions added in each iteration of ZoomOut", least=1,
+        section="4.2", of="Consistent ZoomOut", pair=True)
     n_latent: int | None = network(None, "dimension of the latent space; by default k", least=2,
         section="eq. 3", of="Consistent ZoomOut")
     weights: str = network("cycles",

@@ -82,7 +82,7 @@ def test_files_of_fields_are_read_as_they_are_written(tmp_path):
     for wrong, message in {
         "a.npz": "an array 'curv' expected, found thickness, other",
         "a.ply": "a vertex property 'curv' expected",
-        "a.csv": "a column 'curv' expected, found vertex, thickness",
+        "a.csv": "one column 'curv' needed, found vertex, thickness",
     }.items():
         with pytest.raises(ValueError, match=message):
             read_scalars(tmp_path / wrong, "curv")

@@ -298,7 +298,7 @@ def consistent_zoomout(
     target: Array,
     k: int,
     *,
-    step: int = 8,
+    step: int = 5,
     n_latent: int | None = None,
     weights: str = "cycles",
     isometric: bool = False,
@@ -546,7 +546,7 @@ def frozen_basis(C_out: Array, C_in: Array, Y: Array) -> Array:
     return np.linalg.solve(left, right)
 
 
-def _zoomout_of_new(new, others, Y, C, *, step=8, n_samples=N_SAMPLES, iterations=2):
+def _zoomout_of_new(new, others, Y, C, *, step=5, n_samples=N_SAMPLES, iterations=2):
     """Latent basis of a new shape by Consistent ZoomOut, with all other bases held fixed.
 
     Initialised by the maps of the others.  Each iteration matches the rows of the first latent
@@ -629,7 +629,7 @@ def out_of_sample_basis(
     transforms: list[RigidTransform],
     *,
     k_init: int = 20,
-    step: int = 8,
+    step: int = 5,
     n_samples: int = N_SAMPLES,
     alignment: str = "search",
     **options: Any,

@@ -154,7 +154,7 @@ def from_centroid(X: Array, T: Array) -> tuple[Array, Array]:
 
 
 def without_ties(X: Array, T: Array) -> Array:
-    """Move vertices by at most 1e-4 of the size, so that hardly any two distances are equal.
+    """Move vertices by at most 1e-5 of the size, so that hardly any two distances are equal.
 
     Vertices of surfaces from volumes lie on a grid.  Rounding, also that of a file in single
     precision, would decide between equally distant ones, and the samples would depend on the pose
@@ -162,7 +162,7 @@ def without_ties(X: Array, T: Array) -> Array:
     a chaotic way.  Only samples and cells are computed from these positions.
     """
     offset, radius = from_centroid(X, T)
-    return X + 1e-4 * (1e4 * radius / radius.mean() % 1)[:, None] * offset
+    return X + 1e-5 * (1e4 * radius / radius.mean() % 1)[:, None] * offset
 
 
 def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):

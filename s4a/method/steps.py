@@ -296,7 +296,7 @@ def refine_network(
     initial: xr.Dataset,
     *,
     k: int = 100,
-    step: int = 8,
+    step: int = 5,
     n_latent: int | None = None,
     weights: str = "cycles",
     isometric: bool = False,

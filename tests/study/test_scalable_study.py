@@ -8,7 +8,6 @@ from scipy.spatial.distance import cdist
 from small import FLAGS, OPTIONS
 
 import s4a
-from s4a.analysis import transfer
 from s4a.cli import main
 from s4a.evaluation import accuracy, metrics
 from s4a.method.pca import low_vertices
@@ -16,6 +15,7 @@ from s4a.method.scalable import reduce, reduced
 from s4a.method.shape import Shape
 from s4a.options import Options
 from s4a.show.surfaces import SAMPLES
+from s4a.study import pair
 
 U = {"coarse_vertex", "coarse_weight"}
 LOCAL = {"local_vertex", "local_sample", "local_weight", "sample_cell", "edge_mass"}
@@ -168,13 +168,13 @@ def test_pairs_are_matched_by_it(meshes):
 
 def test_an_external_mesh_is_matched_by_it(paper, meshes, monkeypatch):
     calls = []
-    match = transfer.match_shapes
+    match = pair.match_shapes
 
     def watched(source, target, options):
         calls.append((source.is_sampled, target.is_sampled, options.method))
         return match(source, target, options)
 
-    monkeypatch.setattr(transfer, "match_shapes", watched)
+    monkeypatch.setattr(pair, "match_shapes", watched)
     external = meshes["brain_03"]
     s4a.transfer_labels(paper, external["label"].values, source=external, targets=["brain_01"])
     assert calls == [(True, True, "scalable")]
