@@ -153,8 +153,8 @@ def from_centroid(X: Array, T: Array) -> tuple[Array, Array]:
     return offset, np.linalg.norm(offset, axis=1)
 
 
-def without_ties(X: Array, T: Array) -> Array:
-    """Move vertices by at most 1e-5 of the size, so that hardly any two distances are equal.
+def without_ties(X: Array, T: Array, size: float = 1e-5) -> Array:
+    """Move vertices by at most `size` times the radius, so that hardly any distances are equal.
 
     Vertices of surfaces from volumes lie on a grid.  Rounding, also that of a file in single
     precision, would decide between equally distant ones, and the samples would depend on the pose
@@ -162,7 +162,7 @@ def without_ties(X: Array, T: Array) -> Array:
     a chaotic way.  Only samples and cells are computed from these positions.
     """
     offset, radius = from_centroid(X, T)
-    return X + 1e-5 * (1e4 * radius / radius.mean() % 1)[:, None] * offset
+    return X + size * (1e4 * radius / radius.mean() % 1)[:, None] * offset
 
 
 def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
@@ -195,7 +195,7 @@ def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
         if not faulty:
             break
         if not is_cut:  # cuts depend on the numbering: number from the outside, in any pose
-            is_cut = True
+            is_cut, V = True, without_ties(V, F, 1e-4)
             V, F, origin = _sorted_mesh(V, F, -from_centroid(V, F)[1])
             continue
         region = voronoi.thin_regions(graph, cells)
