@@ -24,8 +24,7 @@ NORMAL_WEIGHT = 0.2
 SIMILAR = 1.2  # ratio of the extents along two principal axes below which they can be exchanged
 DISTINCT = 45.0  # degrees between two poses
 N_POSES = 4  # poses that are compared with all samples
-# residual of a pose over that of the best, up to which it is compared with other shapes: those that
-# fit them best had at most 1.1 among 110 real shapes
+# residual of a pose over that of the best, up to which it is compared with other shapes
 LIKELY = 1.5
 residual_of = itemgetter(2)  # the residual of an ICP result
 

@@ -156,9 +156,9 @@ def from_centroid(X: Array, T: Array) -> tuple[Array, Array]:
 def without_ties(X: Array, T: Array, size: float = 1e-5) -> Array:
     """Move vertices by at most `size` times the radius, so that hardly any distances are equal.
 
-    Vertices of surfaces from volumes lie on a grid.  Rounding, also that of a file in single
-    precision, would decide between equally distant ones, and the samples would depend on the pose
-    of the file.  A vertex moves away from the centroid by a share that follows from its distance in
+    Vertices of surfaces from volumes lie on a grid.  Rounding would decide between equally distant
+    ones, and the samples would depend on the pose of the file; with files in single precision a few
+    still do.  A vertex moves away from the centroid by a share that follows from its distance in
     a chaotic way.  Only samples and cells are computed from these positions.
     """
     offset, radius = from_centroid(X, T)
