@@ -97,11 +97,29 @@ def rigid_transform(
     return R, q - s * R @ p, s
 
 
+def oscillation(P: Array) -> Array:
+    """Return a number in [-1, 1] for each point ``(n, d)`` that breaks ties in any pose.
+
+    Vertices of surfaces from volumes lie on a grid.  Rounding would decide between equally distant
+    ones, and the result would depend on the pose of the file.  The number oscillates with the
+    distance from the mean: slowly enough for the rounding of files in single precision, quickly
+    enough for neighbours.
+    """
+    radius = np.linalg.norm(P - P.mean(0), axis=1)
+    return np.sin(300 * radius / max(radius.mean(), 1e-300))
+
+
+def without_ties(P: Array, size: float = 1e-3) -> Array:
+    """Move points ``(n, d)`` from their mean by at most `size` times the radius; few tie then."""
+    return P + size * oscillation(P)[:, None] * (P - P.mean(0))
+
+
 def farthest_points(P: Array, k: int) -> Array:
     """Return indices of k farthest-point samples (Euclidean).
 
-    The first sample is the point farthest from the mean, so the samples do not depend on the
-    numbering.  If there are at most k points, all are returned in their order.
+    The first sample is the point farthest from the mean, and the points are sampled
+    :func:`without_ties`, so the samples depend neither on the numbering nor on the pose.  If there
+    are at most k points, all are returned in their order.
 
     Parameters
     ----------
@@ -122,6 +140,7 @@ def farthest_points(P: Array, k: int) -> Array:
     """
     if k >= len(P):
         return np.arange(len(P))
+    P = without_ties(P)
     start = int(np.argmax(((P - P.mean(0)) ** 2).sum(1)))
     if not fpsample:
         return farthest_samples(P, k, start)
@@ -179,7 +198,7 @@ def many_farthest_points(P: Array, k: int, *, center: Array, seed: int = 0) -> A
         return np.arange(len(P))
     if k < 1:
         return np.arange(0)
-    P = P - center
+    P = without_ties(P) - center
     radius = np.linalg.norm(P, axis=1)
     if not fpsample:
         if seed:

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 
 from s4a.geometry import mesh as surface
 from s4a.geometry import voronoi
-from s4a.geometry.align import many_farthest_points
+from s4a.geometry.align import many_farthest_points, without_ties
 from s4a.geometry.closest import closest_point, closest_point_in_star
 from s4a.geometry.compiled import robust_laplacian
 from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas, vertex_normals
@@ -38,6 +38,7 @@ from s4a.seeds import RNG, seed_of
 GL = "install the system's libgl1 and libopengl0, or see `s4a doctor`"
 INITIAL_SHARE = 0.95  # of n_coarse that is sampled first; the rest repairs the topology of cells
 MAX_SHARE = 1.1  # of n_coarse, above which handles are cut instead of adding samples
+MOVED = 1e-4  # of the radius, by which vertices move so that U does not depend on rounding
 _N_CUTS = 3  # attempts to cut handles before samples are added without limit
 
 
@@ -146,25 +147,6 @@ def _sorted_mesh(X, T, key=None):
     return X[order], T[surface.lexical_order(np.stack([T[:, 2], first_two], axis=1))], order
 
 
-def from_centroid(X: Array, T: Array) -> tuple[Array, Array]:
-    """Return the vectors ``(n, 3)`` from the centroid of a surface, and their lengths ``(n,)``."""
-    area = vertex_areas(X, T)
-    offset = X - area @ X / area.sum()
-    return offset, np.linalg.norm(offset, axis=1)
-
-
-def without_ties(X: Array, T: Array, size: float = 1e-5) -> Array:
-    """Move vertices by at most `size` times the radius, so that hardly any distances are equal.
-
-    Vertices of surfaces from volumes lie on a grid.  Rounding would decide between equally distant
-    ones, and the samples would depend on the pose of the file; with files in single precision a few
-    still do.  A vertex moves away from the centroid by a share that follows from its distance in
-    a chaotic way.  Only samples and cells are computed from these positions.
-    """
-    offset, radius = from_centroid(X, T)
-    return X + size * (1e4 * radius / radius.mean() % 1)[:, None] * offset
-
-
 def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
     """Manifold dual of about `n_coarse` geodesic Voronoi cells.
 
@@ -178,7 +160,7 @@ def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
     attrs : dict
         Numbers of samples, iterations and vertices cut.
     """
-    V, F = without_ties(X, T), T  # the surface after cutting handles
+    V, F = X, T  # the surface after cutting handles
     origin = np.arange(len(X))  # row of X of each vertex of V, -1 for the centre of a fan
     is_cut = False
     for max_samples in [MAX_SHARE * n_coarse] * (1 + _N_CUTS) + [np.inf]:
@@ -195,8 +177,8 @@ def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
         if not faulty:
             break
         if not is_cut:  # cuts depend on the numbering: number from the outside, in any pose
-            is_cut, V = True, without_ties(V, F, 1e-4)
-            V, F, origin = _sorted_mesh(V, F, -from_centroid(V, F)[1])
+            is_cut = True
+            V, F, origin = _sorted_mesh(V, F, -np.linalg.norm(V - V.mean(0), axis=1))
             continue
         region = voronoi.thin_regions(graph, cells)
         cell_area = triangle_areas(V, F).sum() / n_coarse
@@ -215,14 +197,12 @@ def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
     }
     if attrs["vertices_cut"]:
         cell = cell[_nearest_along_edges(X, T, np.flatnonzero(cell >= 0))]
-    of_sample = origin[state.sample]
-    Y = np.where(of_sample[:, None] >= 0, X[of_sample], V[state.sample])
-    return Y, voronoi.dual(F, state.cell), of_sample, cell, attrs
+    return V[state.sample], voronoi.dual(F, state.cell), origin[state.sample], cell, attrs
 
 
 def _nearest_along_edges(X, T, vertices):
     """Nearest one of some vertices along edges, for each vertex ``(n,)``."""
-    G = surface.edge_graph(X, surface.edges(T))
+    G = voronoi.mesh_graph(X, T).G
     return dijkstra(G, indices=vertices, min_only=True, return_predecessors=True)[2]
 
 
@@ -438,8 +418,10 @@ def coarsen(
     if wrap:
         sample = np.full(len(Y), -1)
         cell = cell[_nearest_with_normal(X, T, V, F)]
+    P = without_ties(X, MOVED)
+    Z = np.where(sample[:, None] >= 0, P[sample], Y)
     triangle, weight = (  # (n,), (n, 3)
-        closest_point(X, Y, C) if sampling == "geodesic" else closest_point_in_star(X, cell, Y, C)
+        closest_point(P, Z, C) if sampling == "geodesic" else closest_point_in_star(P, cell, Z, C)
     )
     corner = C[triangle]  # (n, 3)
     if wrap:
