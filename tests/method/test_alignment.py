@@ -117,7 +117,7 @@ def test_a_study_of_rotated_files_equals_the_first():
 
 
 def test_a_study_flags_ambiguous_poses_and_its_confidence_falls():
-    rods = {f"s{i}": turned(*rod(i, bump=0.1, n=200), i) for i in range(3)}
+    rods = {f"s{i}": turned(*rod(i, bump=0.1, n=1000), i) for i in range(3)}
     study = s4a.analyse(rods, **SMALL)
     report = study["report"]
     assert set(report["status"].values) == {"flagged"}
@@ -128,7 +128,7 @@ def test_a_study_flags_ambiguous_poses_and_its_confidence_falls():
     others = report["shape"].values != study["registration"].attrs["template"]
     assert study["registration"]["confidence"].values[others].max() <= 0.5
     given = s4a.analyse(
-        {n: rod(i, bump=0.1, n=200) for i, n in enumerate(rods)}, alignment="given", **SMALL
+        {n: rod(i, bump=0.1, n=1000) for i, n in enumerate(rods)}, alignment="given", **SMALL
     )
     assert set(given["report"]["status"].values) == {"ok"}
     match = given["registration"]["registered_match"].values

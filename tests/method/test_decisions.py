@@ -179,11 +179,14 @@ def test_initialisations_that_end_within_a_hundredth_are_merged_into_their_mean(
 
 
 def test_collinear_landmarks_do_not_determine_the_rotation(surface):
-    X, tree = surface.X, cKDTree(surface.X)
-    ends = [np.argmin(X[:, 0]), np.argmax(X[:, 0])]
-    # the third is a vertex next to the first in one shape, and the opposite one in the other
-    _, around = tree.query(X[ends[0]], 3)
-    one, other = ({"a": ends[0], "b": ends[1], "c": third} for third in around[1:])
+    X = surface.X
+    start, *near = cKDTree(X).query(X[0], 9)[1]
+    far = np.flatnonzero(np.linalg.norm(X - X[start], axis=1) > 0.5)
+    along = (X[far] - X[start]) / np.linalg.norm(X[far] - X[start], axis=1)[:, None]
+    off = np.linalg.norm(np.cross((X[near] - X[start])[:, None], along), axis=2)  # from the line
+    third, end = np.unravel_index(off.argmin(), off.shape)
+    # the third is a vertex near that line in one shape, and another neighbour in the other
+    one, other = ({"a": start, "b": far[end], "c": c} for c in (near[third], near[third - 1]))
     bases = [replace(surface, landmarks=marks) for marks in (one, other)]
     R, t = alignment.transform_onto(*bases)
     np.testing.assert_allclose(R, np.eye(3), atol=1e-6)

@@ -116,7 +116,7 @@ def test_words_that_options_cannot_be_are_refused_with_those_that_they_can(study
 
 
 def test_a_latent_space_as_large_as_maps_that_are_reduced_is_reduced_with_them():
-    study = s4a.analyse(s4a.synthetic.brains(3, 300), n_coarse=100, n_latent=100)
+    study = s4a.analyse(s4a.synthetic.brains(3, 95), n_coarse=100, n_latent=100)
     k = study["network"].sizes["eigenpair_source"]
     assert k < 100
     assert study["latent"]["latent_basis"].shape == (3, k, k)
