@@ -217,34 +217,37 @@ def accuracy():
         say(name, len(values), *cells)
 
 
-def rotated(meshes, seed):
-    """Return points and triangles in single precision, rotated at random unless the seed is 0."""
+def rotated(meshes, seed, precision):
+    """Return points and triangles of files, rotated at random unless the seed is 0."""
     found = {}
     for i, (name, mesh) in enumerate(meshes.items()):
         X, T = as_arrays(mesh)
         Q = Rotation.random(random_state=100 * seed + i).as_matrix() if seed else np.eye(3)
-        found[name] = (X @ Q.T).astype(np.float32).astype(float), T
+        found[name] = (X @ Q.T).astype(precision).astype(float), T
     return found
 
 
 def rotations(names):
     """Print the differences between studies of rotated files and that of the files as they are."""
-    title("collection", "shapes", "equal matches, least of a shape", "variance ratio, most")
-    for name in names or ROTATED:
+    columns = "equal matches, mean of all", "least of a shape", "variance ratio, most"
+    title("collection", "shapes", "coordinates", "rotations with equal samples", *columns)
+    for name, precision in itertools.product(names or ROTATED, (np.float64, np.float32)):
         meshes = collection(name, ROTATED.get(name, 5))
-        first, *others = (s4a.analyse(rotated(meshes, seed), **SMALL) for seed in range(11))
-        match, ratio = (
-            [study[node][key].values for study in (first, *others)]
-            for node, key in (
-                ("registration", "registered_match"),
-                ("pca", "explained_variance_ratio"),
-            )
-        )
-        equal = min(
-            (match[0] == m).mean(1).min() if m.shape == match[0].shape else 0 for m in match
-        )
-        most = max(np.abs(ratio[0] - r).max() if len(r) == len(ratio[0]) else 1 for r in ratio)
-        say(name, len(meshes), f"{100 * equal:.2f} %", f"{most:.0e}")
+        studies = (s4a.analyse(rotated(meshes, seed, precision), **SMALL) for seed in range(11))
+        rows = [compared_parts(study) for study in studies]
+        (samples, match, ratio), *others = rows
+        same = sum(all(map(np.array_equal, samples, s)) for s, _, _ in others)
+        equal = [(match == m).mean(1) if m.shape == match.shape else 0 for _, m, _ in others]
+        most = max(abs(ratio - r).max() if len(r) == len(ratio) else 1 for *_, r in others)
+        shares = f"{100 * np.mean(equal):.2f} %", f"{100 * np.min(equal):.2f} %"
+        say(name, len(meshes), f"{precision.__name__}", f"{same} of 10", *shares, f"{most:.0e}")
+
+
+def compared_parts(study):
+    """Return the samples of each low-resolution mesh, sorted, the matches, and variance ratios."""
+    samples = [np.sort(node["sample_vertex"].values) for node in study["coarse"].children.values()]
+    match = study["registration"]["registered_match"].values
+    return samples, match, study["pca"]["explained_variance_ratio"].values
 
 
 def landmarks(which, n_coarse=1000):

@@ -188,6 +188,16 @@ def test_farthest_points_are_those_of_the_exhaustive_search(n, k):
 
 
 @pytest.mark.usefixtures("sampler")
+def test_samples_of_points_on_a_grid_do_not_depend_on_their_pose():
+    X = np.unique(np.random.default_rng(0).integers(0, 12, (700, 3)), axis=0).astype(float)
+    R = Rotation.random(random_state=0).as_matrix()
+    for P in (X @ R.T, np.float32(X @ R.T)):
+        assert np.array_equal(align.farthest_points(X, 100), align.farthest_points(P, 100))
+        one, other = (align.many_farthest_points(Y, 100, center=Y.mean(0), seed=3) for Y in (X, P))
+        assert np.array_equal(one, other)
+
+
+@pytest.mark.usefixtures("sampler")
 def test_another_seed_or_centre_starts_elsewhere():
     X = np.random.default_rng(7).normal(size=(500, 3))
     center = np.zeros(3)

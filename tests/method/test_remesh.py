@@ -139,7 +139,7 @@ def test_the_coarse_mesh_is_a_manifold_of_the_same_topology_near_the_size_asked_
     assert 0.9 * n_coarse <= coarse.sizes["vertex"] <= 1.2 * n_coarse
 
 
-def test_samples_of_a_surface_on_a_grid_with_thin_handles_do_not_depend_on_its_pose():
+def test_samples_and_u_of_a_surface_on_a_grid_with_thin_handles_do_not_depend_on_its_pose():
     marching_cubes = pytest.importorskip("skimage.measure").marching_cubes
     noise = np.random.default_rng(0).normal(size=(30, 30, 30))
     radius = np.linalg.norm(np.indices(noise.shape) - 14.5, axis=0)
@@ -150,6 +150,12 @@ def test_samples_of_a_surface_on_a_grid_with_thin_handles_do_not_depend_on_its_p
     one, other = (coarsen(as_dataset(P, T), n_coarse=100) for P in (X, np.float32(X @ R.T)))
     assert one.attrs["vertices_cut"] > 100
     assert {*one["sample_vertex"].values} == {*other["sample_vertex"].values}
+    center = X.mean(0), np.float32(X @ R.T).mean(0)
+    f, g = (
+        apply_u(c, np.linalg.norm(c["position"].values - x, axis=1))
+        for c, x in zip((one, other), center, strict=True)
+    )
+    assert np.abs(f - g).max() < 1e-4
 
 
 @pytest.mark.parametrize("surface", [bumpy, torus, double_torus, plane])
