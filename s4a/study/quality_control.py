@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import xarray as xr
-from scipy import stats
 from scipy.spatial.distance import pdist, squareform
+from scipy.special import betaincc
 
 from s4a.geometry.crossing import can_count
 from s4a.input.plausibility import (
@@ -273,7 +273,7 @@ def check_modes(pca: xr.Dataset, area: float) -> Flags:
     names, n = pca["shape"].values.tolist(), pca.sizes["shape"]
     score, ratio = pca["score"].values, pca["explained_variance_ratio"].values
     share = score**2 / (score**2).sum(0)  # (n, c)
-    p = n * stats.beta.sf(share.max(0) * n / (n - 1), 0.5, (n - 2) / 2)
+    p = n * betaincc(0.5, (n - 2) / 2, np.minimum(share.max(0) * n / (n - 1), 1))
     for c in np.flatnonzero((share.max(0) > SHARE) & (p < ALONE) & (ratio > LARGE)):
         values = {"component": c + 1, "percent": 100 * share[:, c].max()}
         one = flag("influential", **values, mode_percent=100 * ratio[c])
