@@ -41,10 +41,13 @@ WRONG_RATIO, UNSURE_RATIO = 2.0, 1.5
 FEW, SHARE, ALONE, LARGE = 6, 0.7, 0.001, 0.3
 # near copies: largest distance over the usual one and over sqrt(area), and largest p value
 NEAR, COPY, CHANCE = 0.2, 0.005, 0.02
+NOT_COMPARED = "quality_control='off': mirrored, partial or duplicate shapes are not detected"
 
 
 def check_plausibility(run: Run, original: Keys, options: Options) -> tuple[Keys, Flags, list[str]]:
     """Compare the shapes with each other, and flag suspect ones.
+
+    With ``quality_control="off"`` they are not compared, and only what cleaning found is reported.
 
     Returns
     -------
@@ -56,6 +59,9 @@ def check_plausibility(run: Run, original: Keys, options: Options) -> tuple[Keys
     if len(original) < 2:
         return original, {}, []
     attrs = {n: attributes(run.folder / f"original/{n}.nc") for n in original}
+    if options.quality_control == "off":
+        flags, remarks = find_warnings(attrs, {})
+        return original, flags, [*remarks, NOT_COMPARED]
     compared = comparisons_of(run, original, options)
     used = {n: attrs[n] for n in compared}
     return {n: original[n] for n in compared}, *find_warnings(used, compared)

@@ -2,6 +2,7 @@
 
 import contextlib
 import faulthandler
+import functools
 import logging
 import os
 import sys
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from joblib import delayed, effective_n_jobs
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 from tqdm.auto import tqdm
 
 from s4a.input.raw import sentences
@@ -310,6 +311,12 @@ class Run:
                 self.bar.close()
 
 
+@functools.cache
+def blas() -> ThreadpoolController:
+    """Return the BLAS libraries of this process, which take two milliseconds to find."""
+    return ThreadpoolController()
+
+
 def do_task(task: Task, claim: Claim) -> Outcome:
     """Compute one Dataset and write its file, with one BLAS thread, as tasks run in parallel."""
     claim.check()
@@ -317,7 +324,7 @@ def do_task(task: Task, claim: Claim) -> Outcome:
     failure, unforeseen = "", False
     with at_work(file, claim):
         try:
-            with threadpool_limits(1):
+            with blas().limit(limits=1):
                 data = task.function(*task.arguments)
             name, path = task.file.removesuffix(".nc"), claim.folder / task.file
             write(data, path, task.key, task.made_from, claim, name=name)
