@@ -15,7 +15,7 @@ import json
 import math
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import BufferedIOBase
 from pathlib import Path
@@ -91,11 +91,13 @@ def stored_in(file: h5f.FileID, name: str) -> Any:
     return stored
 
 
-def values_of(file: h5f.FileID, name: str) -> np.ndarray:
-    """Read the numbers of a variable; OSError unless they are stored in the file itself."""
+def values_of(file: h5f.FileID, name: str, shape: Sequence[int] | None = None) -> np.ndarray:
+    """Read the numbers of a variable; OSError unless they are in the file, and of this shape."""
     stored = stored_in(file, name)
     if not isinstance(stored, h5d.DatasetID):
         raise OSError(f"{name} is not a variable")
+    if shape is not None and stored.shape != tuple(shape):
+        raise OSError(f"{name} has another shape than its contents say")
     check_contained(stored, name)
     if stored.dtype.kind not in "iuf":
         raise OSError(f"{name} needs numbers, found {stored.dtype}")
@@ -177,10 +179,8 @@ def values_in(file: h5f.FileID, path: str, entry: Mapping[str, Any]) -> np.ndarr
     dtype = type_of(entry)
     if "values" in entry:
         values = np.array(entry["values"], object)
-    elif stored_in(file, path).shape != tuple(entry["shape"]):
-        raise OSError(f"{path} has another shape than its contents say")
     else:
-        values = values_of(file, path)
+        values = values_of(file, path, entry["shape"])
     if dtype.kind == "U":  # NumPy pads each text to the longest
         if 4 * max(map(len, values.flat), default=0) * values.size > LARGEST_TEXT:
             raise OSError(f"{path} has more text than its file")

@@ -245,8 +245,7 @@ class Run:
                     yield delayed(do_task)(todo[name], self.claim)
 
             n_jobs = max(2, effective_n_jobs(self.n_jobs)) if alone else self.n_jobs
-            # meshes in memory are sent through a pipe, as shared files would outlive a killed run
-            parallel = workers(n_jobs, return_as="generator_unordered", max_nbytes=None)
+            parallel = workers(n_jobs, return_as="generator_unordered")
             try:
                 for outcome in parallel(jobs()):
                     yield outcome
