@@ -468,21 +468,23 @@ def _sphere(n):
     return u, _delaunay(u)
 
 
-def _mesh(truth, shape, n_vertices, rng):
-    """Sample reference points by farthest points on the shape, and triangulate them."""
+def _clean_brain(truth, shape, n_vertices, seed):
+    """Return farthest-point samples of a shape, their triangles, and their reference points."""
+    rng = np.random.default_rng([seed, 1, _index(truth, shape)])
     if n_vertices < 4:
         raise ValueError(f"n_vertices must be at least 4 for a closed mesh; found {n_vertices}")
     u = _fibonacci(5 * n_vertices) @ Rotation.random(random_state=rng).as_matrix().T
     u = _unit(u + rng.normal(0, 0.3 * np.sqrt(4 * np.pi / len(u)), u.shape))
-    x = position(truth, shape, u).astype(np.float32)
+    X = position(truth, shape, u)
+    x = X.astype(np.float32)
     start = int(rng.integers(len(u)))
     if fpsample:
         h = min(7, int(np.log2(len(u))))  # levels of the tree; no leaf may be empty
         sample = fpsample.bucket_fps_kdline_sampling(x, n_vertices, h=h, start_idx=start)
     else:
         sample = farthest_samples(x, n_vertices, start)
-    u = u[np.sort(sample)]
-    return u, _delaunay(u)
+    sample = np.sort(sample)
+    return X[sample], _delaunay(u[sample]), u[sample]
 
 
 def labels(reference_point: ArrayLike) -> np.ndarray:
@@ -513,12 +515,6 @@ def _annotate(mesh, truth, shape, reference_point):
     )
     annotations["label"].attrs["names"] = LABELS
     return in_unit(mesh.merge(annotations).assign_attrs(unit="mm", coordinate_system="RAS"), "mm")
-
-
-def _clean_brain(truth, shape, n_vertices, seed):
-    """Return points, triangles and reference points of a brain, see :func:`_raw_brain`."""
-    u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, _index(truth, shape)]))
-    return position(truth, shape, u), T, u
 
 
 def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
@@ -552,9 +548,8 @@ def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
     (True, True)
     """
     seed = seed_of(seed, rng)
-    i = _index(truth, shape)
-    u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
-    return _add_artefacts(position(truth, shape, u), T, u, np.random.default_rng([seed, 2, i]))
+    rng_of_artefacts = np.random.default_rng([seed, 2, _index(truth, shape)])
+    return _add_artefacts(*_clean_brain(truth, shape, n_vertices, seed), rng_of_artefacts)
 
 
 def _reference_after_cleaning(mesh, raw, reference_point):
