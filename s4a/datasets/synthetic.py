@@ -468,9 +468,9 @@ def _sphere(n):
     return u, _delaunay(u)
 
 
-def _clean_brain(truth, shape, n_vertices, seed):
+def _clean_brain(truth, shape, n_vertices, seed=0, *, rng=None):
     """Return farthest-point samples of a shape, their triangles, and their reference points."""
-    rng = np.random.default_rng([seed, 1, _index(truth, shape)])
+    rng = rng or np.random.default_rng([seed, 1, _index(truth, shape)])
     if n_vertices < 4:
         raise ValueError(f"n_vertices must be at least 4 for a closed mesh; found {n_vertices}")
     u = _fibonacci(5 * n_vertices) @ Rotation.random(random_state=rng).as_matrix().T
