@@ -50,7 +50,7 @@ def simple_matches(
 def _errors(source, target, registered, image, n_vertices, n_geodesic):
     """Mean Euclidean errors of all methods on one shape, and geodesic ones if requested."""
     known = np.flatnonzero(np.isfinite(image).all(axis=1))
-    vertex = known[:: max(1, len(known) // (n_vertices or len(known)))]
+    vertex = known[:: max(1, len(known) // (n_vertices or len(image)))]
     image = image[vertex]
     (X, T), size = as_arrays(source.original), source.frame[1]
     with threadpool_limits(1):
