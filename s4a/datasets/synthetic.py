@@ -548,8 +548,8 @@ def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
     (True, True)
     """
     seed = seed_of(seed, rng)
-    rng_of_artefacts = np.random.default_rng([seed, 2, _index(truth, shape)])
-    return _add_artefacts(*_clean_brain(truth, shape, n_vertices, seed), rng_of_artefacts)
+    X, T, u = _clean_brain(truth, shape, n_vertices, seed)
+    return _add_artefacts(X, T, u, np.random.default_rng([seed, 2, _index(truth, shape)]))
 
 
 def _reference_after_cleaning(mesh, raw, reference_point):
