@@ -269,92 +269,71 @@ def _routes_from_outside(
     return routes
 
 
-Targets = Iterator[tuple[str, xr.Dataset, list[Route]]]
-
-
 def plan(
     study: xr.DataTree,
+    given: Any,
     source: str | xr.Dataset | None,
     targets: list[str] | None,
     options: dict[str, Any] | None = None,
-) -> tuple[xr.Dataset, Targets]:
-    """Return the source mesh, and an iterator of (target name, mesh, routes to it).
+) -> tuple[list[tuple[xr.Dataset, Any]], Iterator[tuple[str, xr.Dataset, list[list[Route]]]]]:
+    """Return (mesh, values) of every source, and an iterator of (target, mesh, routes by source).
 
     Parameters
     ----------
     study, source, targets : see :func:`transfer_labels`
+    given : object or dict
+        Values of one `source`, or a dict of names of sources to their values.
     options : dict, optional
         Options of the match of an external source, which replace those of the study.
 
     Raises
     ------
     ValueError
-        If the study has no registration or lacks a shape, or options are given without an external
-        source.
+        If the study has no registration or lacks a shape, there is no source, or options are given
+        without an external source.
     """
-    registration = all_registered(study)
-    template = registration.attrs["template"]
-    names = registration["shape"].values.tolist()
-    source = template if source is None else source
-    external = isinstance(source, xr.Dataset)
-    targets = [n for n in names if external or n != source] if targets is None else list(targets)
-    needed = targets if external or source == template else [*targets, source]
-    unknown = [n for n in needed if n not in names]
-    if unknown:
-        raise ValueError(
-            f"no shape {', '.join(map(repr, unknown))} in the study; it has {', '.join(names)}"
-        )
-    if isinstance(source, xr.Dataset):
-        require(source, "position", "corner_vertex", what="source")
-        both = {"template": study["original"][template].to_dataset(), "source": source}
-        mesh = in_one_system(both)["source"]
-        up = _routes_from_outside(study, mesh, options or {})
-    elif options:
-        raise ValueError(
-            f"options {', '.join(options)} need an external source, which is matched to the "
-            f"template; found the shape {source!r}, which is registered: leave them out"
-        )
-    else:
-        mesh, up = study["original"][source].to_dataset(), _routes(study, source)[1]
-
-    def routes_to_targets():
-        for name in targets:
-            down, _ = _routes(study, name)
-            yield name, study["original"][name].to_dataset(), [a + b for a in up for b in down]
-
-    return mesh, routes_to_targets()
-
-
-def plan_several(
-    study: xr.DataTree,
-    given: Any,
-    source: str | xr.Dataset | None,
-    targets: list[str] | None,
-    options: dict[str, Any],
-) -> tuple[list[tuple[xr.Dataset, Any]], Iterator[tuple[str, xr.Dataset, list[list[Route]]]]]:
-    """Return (mesh, values) of every source, and an iterator of (target, mesh, routes by source).
-
-    `given` are the values of one `source`, or a dict of names of sources to their values.
-    """
-    several = isinstance(given, dict)
-    if several and (source is not None or not given):
+    if isinstance(given, dict) and (source is not None or not given):
         raise ValueError(
             f"a dict of sources to their values replaces source=; found {len(given)} sources and "
             f"source={source if isinstance(source, str) or source is None else 'a mesh'!r}"
         )
-    sources = list(given.items()) if several else [(source, given)]
-    if several and targets is None:
-        names = all_registered(study)["shape"].values.tolist()
-        targets = [name for name in names if name not in given]
-    plans = [plan(study, name, targets, options) for name, _ in sources]
+    registration = all_registered(study)
+    template, names = registration.attrs["template"], registration["shape"].values.tolist()
+    pairs = [*given.items()] if isinstance(given, dict) else [(source, given)]
+    pairs = [(template if one is None else one, values) for one, values in pairs]
+    inside = [one for one, _ in pairs if not isinstance(one, xr.Dataset)]
+    targets = [n for n in names if n not in inside] if targets is None else list(targets)
+    unknown = [n for n in (*targets, *inside) if n not in names]
+    unknown = [n for n in unknown if n in targets or n != template]
+    if unknown:
+        raise ValueError(
+            f"no shape {', '.join(map(repr, unknown))} in the study; it has {', '.join(names)}"
+        )
+    starts = [_start(study, one, options or {}) for one, _ in pairs]
 
     def routes_to_targets():
-        for steps in zip(*(steps for _, steps in plans), strict=True):
-            name, target, _ = steps[0]
-            yield name, target, [routes for *_, routes in steps]
+        for name in targets:
+            down, _ = _routes(study, name)
+            routes = [[a + b for a in up for b in down] for _, up in starts]
+            yield name, study["original"][name].to_dataset(), routes
 
-    meshes = [mesh for mesh, _ in plans]
-    return list(zip(meshes, (values for _, values in sources), strict=True)), routes_to_targets()
+    sources = [(mesh, values) for (mesh, _), (_, values) in zip(starts, pairs, strict=True)]
+    return sources, routes_to_targets()
+
+
+def _start(study, source, options):
+    """Mesh of a source, a shape or an external mesh, and its routes up to the template."""
+    if isinstance(source, xr.Dataset):
+        require(source, "position", "corner_vertex", what="source")
+        template = study["original"][study["registration"].attrs["template"]].to_dataset()
+        mesh = in_one_system({"template": template, "source": source})["source"]
+        return mesh, _routes_from_outside(study, mesh, options)
+    if options:
+        raise ValueError(
+            f"options {', '.join(options)} need an external source, which is matched to the "
+            f"template; found the shape {source!r}, which is registered: leave them out"
+        )
+    return study["original"][source].to_dataset(), _routes(study, source)[1]
 
 
 def transfer_labels(
@@ -448,7 +427,7 @@ def transfer_labels(
     """
     if blur is not None and not 0 <= blur <= 10:
         raise ValueError(f"blur needs a factor from 0 to 10; found {blur}")
-    sources, routes_to_targets = plan_several(study, label, source, targets, options)
+    sources, routes_to_targets = plan(study, label, source, targets, options)
     blur = BLURS[_preset(study, options)] if blur is None else blur
     labels = [_per_vertex(values, mesh, "label") for mesh, values in sources]
     transferred = {}
@@ -517,10 +496,10 @@ def transfer_scalars(
     >>> bool(np.allclose(result["brain_02/field"], 1))
     True
     """
-    mesh, routes_to_targets = plan(study, source, targets, options)
+    [(mesh, _)], routes_to_targets = plan(study, None, source, targets, options)
     field = _per_vertex(field, mesh, "field").astype(float)
     transferred = {}
-    for name, _, routes in routes_to_targets:
+    for name, _, [routes] in routes_to_targets:
         value, confidence = _blend_field(routes, field)
         transferred[name] = dataset(field=value, confidence=confidence.astype(np.float32))
     return xr.DataTree.from_dict(transferred)
@@ -634,7 +613,7 @@ def transfer_landmarks(
     >>> s4a.show.charts.surfaces(shown, colors)
     <TiledFigure ...>
     """
-    sources, routes_to_targets = plan_several(study, landmarks, source, targets, options)
+    sources, routes_to_targets = plan(study, landmarks, source, targets, options)
     marked = [_located(marks, mesh, farthest) for mesh, marks in sources]
     marked = [marked[0], *(_in_order_of(marked[0], one) for one in marked[1:])]
     named = marked[0][[name for name in NAMED if name in marked[0]]]
@@ -707,8 +686,7 @@ def correspondence(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
     >>> found["image_position"].shape, bool((found["image_barycentric"].sum("corner") > 0.99).all())
     ((200, 3), True)
     """
-    mesh, routes_to_targets = plan(study, source, [target])
-    _, shape, routes = next(routes_to_targets)
+    [(mesh, _)], [(_, shape, [routes])] = plan(study, None, source, [target])
     vertices = identity(Shape(mesh))
     points = vertices["template_triangle"].values, vertices["template_barycentric"].values
     paths = [(points, route) for route in routes]

@@ -4,6 +4,8 @@ Half-edge ``h = t + m * i`` of m triangles runs from corner i of triangle t to i
 mate is the half-edge of the neighbour across the edge, -1 if there is none.
 """
 
+import re
+
 import numpy as np
 import scipy.sparse as sp
 import xarray as xr
@@ -50,14 +52,6 @@ REPAIRS = {
     "dropped_components": "components dropped",
     "unreferenced_vertices": "vertices without triangles dropped",
     "closed_holes": "holes closed",
-}
-_SINGULAR = {
-    "vertices": "vertex",
-    "triangles": "triangle",
-    "edges": "edge",
-    "sides": "side",
-    "components": "component",
-    "holes": "hole",
 }
 
 
@@ -210,7 +204,7 @@ def repairs(counts: dict[str, int | float]) -> str:
 
 
 def counted(n: float, text: str) -> str:
-    """Put a number before its noun, in singular or plural.
+    """Put a number before its noun, the first plural of the text; in the singular after 1.
 
     Examples
     --------
@@ -219,8 +213,7 @@ def counted(n: float, text: str) -> str:
     ('1 hole closed', '2 holes closed')
     """
     if n == 1:
-        plural = next(word for word in text.split() if word in _SINGULAR)
-        text = text.replace(plural, _SINGULAR[plural], 1)
+        text = re.sub(r"vertices|(\w+)s\b", lambda plural: plural[1] or "vertex", text, count=1)
     return f"{n} {text}"
 
 
