@@ -624,8 +624,8 @@ def check_choice(name: str, value: object, legal: Collection[object]) -> None:
         raise ValueError(f"{name} must be one of {choices}; found {value!r}")
 
 
-def check_count(name: str, value: object, least: int = 0) -> None:
-    """Raise ValueError unless an option is an integer from `least` to :data:`LARGEST_COUNT`.
+def check_count(name: str, value: object, least: int = 0, most: int = LARGEST_COUNT) -> None:
+    """Raise ValueError unless an option is an integer from `least` to `most`.
 
     Examples
     --------
@@ -634,10 +634,8 @@ def check_count(name: str, value: object, least: int = 0) -> None:
     Traceback (most recent call last):
     ValueError: n_pairs must be an integer of at most 2147483647; found a larger one
     """
-    if isinstance(value, int | np.integer) and value > LARGEST_COUNT:
-        raise ValueError(
-            f"{name} must be an integer of at most {LARGEST_COUNT}; found a larger one"
-        )
+    if isinstance(value, int | np.integer) and value > most:
+        raise ValueError(f"{name} must be an integer of at most {most}; found a larger one")
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name} must be an integer of at least {least}; found {value!r}")
 

@@ -26,7 +26,7 @@ from s4a.analysis.permutation import (
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import gram, principal_components
-from s4a.schema import check_type, dataset, in_unit, unit_of
+from s4a.schema import check_choice, check_type, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
 log = logging.getLogger(__name__)
@@ -571,8 +571,7 @@ def _report_unequal_variances(coordinates, x, sample):
 
 def fields_to_test(d: np.ndarray, registration: xr.Dataset, of: str) -> np.ndarray:
     """Return the fields ``(s, n, k)`` of a test at every vertex: vectors or normal components."""
-    if of not in ("vector", "normal"):
-        raise ValueError(f"of must be 'vector' or 'normal'; found {of!r}")
+    check_choice("of", of, ("vector", "normal"))
     if of == "vector":
         return d
     return normal_displacement(d, vertex_normals(*as_arrays(registration)))[..., None]

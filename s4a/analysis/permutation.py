@@ -19,25 +19,18 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from s4a.schema import check_choice, check_count
+
 log = logging.getLogger(__name__)
 
-MOST_PERMUTATIONS = 10_000_000
 # variance inflation factors from which covariates are reported, and a variable cannot be tested
 INFLATED, MOST_INFLATED = 10.0, 1e4
-VARIANCES = ("equal", "unequal")
-
-
-def check_count(n: int, name: str = "n_permutations", least: int = 1) -> None:
-    """Raise ValueError unless a number, of permutations by default, is in range."""
-    if not least <= n <= MOST_PERMUTATIONS:
-        raise ValueError(f"{name} needs a number from {least} to {MOST_PERMUTATIONS}; found {n}")
 
 
 def check_options(n_permutations: int, variances: str, seed: int) -> dict[str, Any]:
     """Return the options of a :class:`Model` after a check."""
-    check_count(n_permutations)
-    if variances not in VARIANCES:
-        raise ValueError(f"variances must be 'equal' or 'unequal'; found {variances!r}")
+    check_count("n_permutations", n_permutations, 1)
+    check_choice("variances", variances, ("equal", "unequal"))
     return {"n_permutations": n_permutations, "variances": variances, "seed": seed}
 
 
@@ -349,9 +342,10 @@ class Model:
             code = self._code()
             signs = itertools.product([1.0, -1.0], repeat=int(code.max()))
             return (np.array([1.0, *row])[code] for row in signs)
-        if self.blocks is None:
-            return _all_orders(self.rows)
-        return _orders_within(self.rows, self.block_rows)
+        blocks = self.block_rows
+        orders = [[rows[order] for order in _all_orders(self.rows[rows])] for rows in blocks]
+        place = np.argsort(np.concatenate(blocks))
+        return (np.concatenate(chosen)[place] for chosen in itertools.product(*orders))
 
     def p_values(
         self, statistic: Callable[[list[np.ndarray]], np.ndarray], least: Any, at_once: int
@@ -492,15 +486,6 @@ def _count_orders(rows):
     """Number of distinct orders of rows."""
     counts = np.unique(rows, axis=0, return_counts=True)[1].tolist()
     return math.factorial(len(rows)) // math.prod(map(math.factorial, counts))
-
-
-def _orders_within(rows, block_rows):
-    """All orders that leave each shape in its block, the identity first."""
-    orders = [[block[order] for order in _all_orders(rows[block])] for block in block_rows]
-    for chosen in itertools.product(*orders):
-        order = np.empty(len(rows), int)
-        order[np.concatenate(block_rows)] = np.concatenate(chosen)
-        yield order
 
 
 def _drawn_within(blocks, rng):
