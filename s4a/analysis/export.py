@@ -22,6 +22,7 @@ from s4a.input.coordinates import (
     turned,
 )
 from s4a.input.files import write_mesh
+from s4a.schema import check_choice
 from s4a.study import store
 
 FORMATS = {"ply": ".ply", "vtk": ".vtk", "obj": ".obj", "npz": ".npz", "gifti": ".gii"}
@@ -102,11 +103,8 @@ def write_registered(
     >>> [path.name for path in s4a.write_registered(study, folder)][5:8]
     ['brain_06.ply', 'template.ply', 'scores.csv']
     """
-    if format not in FORMATS or frame not in ("template", "shape"):
-        raise ValueError(
-            f"format must be one of {', '.join(FORMATS)}, frame template or shape; found "
-            f"{format!r}, {frame!r}"
-        )
+    check_choice("format", format, FORMATS)
+    check_choice("frame", frame, ("template", "shape"))
     registration = registration_of(study)
     names = registration["shape"].values.tolist()
     if "template" in names:
@@ -131,9 +129,7 @@ def write_registered(
             points = moved(image_in_shape(X, registered), M)
             triangles = turned(T, M)
         has_scalars = format != "obj" and "confidence" in registered
-        scalars: dict[str, Any] = {}
-        if has_scalars:
-            scalars["confidence"] = registered["confidence"].values
+        scalars: Any = {"confidence": registered["confidence"].values} if has_scalars else {}
         paths.append(folder / f"{name}{suffix}")
         write_mesh(paths[-1], points, triangles, **system.attrs, **scalars)
     paths.append(folder / f"template{suffix}")
@@ -145,8 +141,7 @@ def write_registered(
 
 def system_of_template(study: xr.DataTree, name: str) -> CoordinateSystem:
     """Return the axes and unit of shapes that are aligned to the template, without c_ras."""
-    meshes = study["original"].children if "original" in study.children else {}
-    system = CoordinateSystem.of(meshes[name].attrs if name in meshes else {})
+    system = CoordinateSystem.of(_attrs_of(study, name))
     return replace(system, origin=UNKNOWN if system.axes else "", to_scanner=None)
 
 
@@ -164,22 +159,20 @@ def map_to_scan(
     unit : str
         Unit to convert to, if that of the file is known.
     """
-    meshes = study["original"].children if "original" in study.children else {}
-    attrs = meshes[name].attrs if name in meshes else {"reflected": is_reflected(study, name)}
+    attrs = _attrs_of(study, name)
     system = file_system(attrs).filled(given or CoordinateSystem())
     written = system.in_world(unit=unit)
     return map_between(system, written, name) @ map_to_file(attrs), written
 
 
-def is_reflected(study: xr.DataTree, name: str) -> bool:
-    """Return whether the run mirrored a shape."""
+def _attrs_of(study, name):
+    """Attributes of a mesh; of a study without meshes, whether the run mirrored the shape."""
     if "original" in study.children:
         meshes = study["original"].children
-        return name in meshes and bool(meshes[name].attrs.get("reflected"))
+        return meshes[name].attrs if name in meshes else {}
     report = study["report"].to_dataset() if "report" in study.children else xr.Dataset()
-    if "reflected" not in report:  # as in restricted studies
-        return False
-    return bool(report["reflected"].sel(shape=name))
+    is_known = "reflected" in report and name in report["shape"]  # not in restricted studies
+    return {"reflected": bool(report["reflected"].sel(shape=name))} if is_known else {}
 
 
 def _write_modes(pca, folder, n_modes):

@@ -23,7 +23,7 @@ from s4a.geometry.compiled import fpsample
 from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, vertex_areas
 from s4a.input.collection import read_shapes
 from s4a.input.files import write_mesh
-from s4a.schema import dataset, in_unit
+from s4a.schema import check_choice, check_count, dataset, in_unit
 from s4a.seeds import RNG, seed_of
 from s4a.study.pipeline import analyse
 
@@ -174,12 +174,12 @@ def _step(x, width):
     return 0.5 * (1 + np.tanh(x / width))
 
 
-def _fold_noise(p, wavelength=30.0, waves=48):
+def _fold_noise(p):
     """Random field of one wavelength and unit variance, whose zeros are the sulci.
 
     The field is nearly mirror-symmetric in x.
     """
-    rng = np.random.default_rng(20)
+    rng, wavelength, waves = np.random.default_rng(20), 30.0, 48
     k = rng.normal(size=(waves, 3))
     k *= 2 * np.pi / wavelength / np.linalg.norm(k, axis=1, keepdims=True)
     phase = rng.uniform(0, 2 * np.pi, waves)
@@ -277,8 +277,7 @@ def _true_modes(n_modes):
     On the reference brain the modes are orthogonal to rigid transforms and to each other, by a
     Cholesky factor of the Gram matrix of the generators.
     """
-    if not 0 <= n_modes <= len(MODES):
-        raise ValueError(f"n_modes needs a number from 0 to {len(MODES)}, found {n_modes}")
+    check_count("n_modes", n_modes, 0, len(MODES))
     centre, width, rows = _generators(n_modes)
     u, T = _sphere(4000)
     x = reference_brain(u)
@@ -351,8 +350,7 @@ def simulate(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = 
     >>> truth["true_score"].std("shape").values.round(6).tolist()
     [1.0, 1.0, 1.0]
     """
-    if n < 1:
-        raise ValueError(f"n, the number of shapes, must be at least 1; found {n}")
+    check_count("n", n, 1)
     seed = seed_of(seed, rng)
     draw = np.random.default_rng([seed, 0])
     centre, width, translation, rotation = _true_modes(n_modes)
@@ -426,8 +424,7 @@ def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: Array
 def _index(truth, shape):
     """Row of a shape in the ground truth."""
     names = truth["shape"].values.tolist()
-    if shape not in names:
-        raise ValueError(f"shape must be one of {', '.join(names)}; found {shape!r}")
+    check_choice("shape", shape, names)
     return names.index(shape)
 
 
@@ -465,8 +462,7 @@ def _sphere(n):
 
 def _mesh(truth, shape, n_vertices, rng):
     """Sample reference points by farthest points on the shape, and triangulate them."""
-    if n_vertices < 4:
-        raise ValueError(f"n_vertices must be at least 4 for a closed mesh; found {n_vertices}")
+    check_count("n_vertices", n_vertices, 4)
     u = _fibonacci(5 * n_vertices) @ Rotation.random(random_state=rng).as_matrix().T
     u = _unit(u + rng.normal(0, 0.3 * np.sqrt(4 * np.pi / len(u)), u.shape))
     x = position(truth, shape, u).astype(np.float32)
@@ -508,42 +504,6 @@ def _annotate(mesh, truth, shape, reference_point):
     )
     annotations["label"].attrs["names"] = LABELS
     return in_unit(mesh.merge(annotations).assign_attrs(unit="mm", coordinate_system="RAS"), "mm")
-
-
-def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
-    """Return a brain with the artefacts of :func:`_add_artefacts`.
-
-    Parameters
-    ----------
-    truth, shape : as for :func:`position`
-    n_vertices : int
-        Without the artefacts.
-    seed : int
-        Seed of the random numbers.
-    rng : int or numpy.random.Generator, optional
-        Replaces `seed`, as in SPEC 7.
-
-    Returns
-    -------
-    points : float ndarray (p, 3)
-    triangles : int32 ndarray (m, 3)
-    reference_point : float ndarray (p, 3)
-        NaN in loose components and at unreferenced vertices.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import s4a
-    >>> from s4a.datasets.synthetic import _raw_brain
-    >>> truth = s4a.synthetic.simulate(2)
-    >>> points, triangles, reference_point = _raw_brain(truth, "brain_01", 500)
-    >>> len(points) > 500, bool(np.isnan(reference_point).any())
-    (True, True)
-    """
-    seed = seed_of(seed, rng)
-    i = _index(truth, shape)
-    u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
-    return _add_artefacts(position(truth, shape, u), T, u, np.random.default_rng([seed, 2, i]))
 
 
 def _reference_after_cleaning(mesh, raw, reference_point):
@@ -625,11 +585,10 @@ def brains(
     truth = simulate(n, seed, n_modes=n_modes)
     raw = {}
     for i, shape in enumerate(truth["shape"].values.tolist()):
-        if dirty:
-            raw[shape] = _raw_brain(truth, shape, n_vertices, seed)
-        else:
-            u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
-            raw[shape] = position(truth, shape, u), T, u
+        u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
+        brain = position(truth, shape, u), T, u
+        artefacts = np.random.default_rng([seed, 2, i])
+        raw[shape] = _add_artefacts(*brain, artefacts) if dirty else brain
     shapes = read_shapes({shape: (X, T) for shape, (X, T, _) in raw.items()}, compare=False)
     nodes = {"/report": shapes["report"].to_dataset(), "/truth": truth}
     for shape, (X, T, u) in raw.items():

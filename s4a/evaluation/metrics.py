@@ -22,7 +22,7 @@ from s4a.geometry.mesh import (
     vertex_areas,
 )
 from s4a.method.deform import distortion as distortion
-from s4a.schema import dataset, require
+from s4a.schema import check_choice, dataset, require
 
 THRESHOLDS = np.linspace(0, 0.25, 101)  # of the error curve, as in Kim et al. (2011), Fig. 6
 
@@ -91,8 +91,7 @@ def hausdorff(X: np.ndarray, Y: np.ndarray, formula: str = "standard") -> float:
     >>> s4a.metrics.hausdorff(X, Y), s4a.metrics.hausdorff(X, Y, "paper")
     (2.0, 2.0)
     """
-    if formula not in ("standard", "paper"):
-        raise ValueError(f"formula must be 'standard' or 'paper', found {formula!r}")
+    check_choice("formula", formula, ("standard", "paper"))
     forth, back = (distance.max() for distance in nearest_distances(X, Y))
     return float(max(forth, back) if formula == "standard" else forth + back / len(Y))
 
@@ -255,44 +254,6 @@ def cycle_error(
     return geodesic_error(X, T, end, start, limit=limit)
 
 
-def bijectivity(
-    X: np.ndarray,
-    T: np.ndarray,
-    match: np.ndarray,
-    reverse: np.ndarray,
-    *,
-    vertices: np.ndarray | None = None,
-    limit: float = 1.0,
-) -> np.ndarray:
-    """Return the :func:`cycle_error` target -> source -> target; 0 for a map and its inverse.
-
-    Parameters
-    ----------
-    X, T : mesh of the target
-    match : int ndarray (n_target,)
-        Vertices of the source.
-    reverse : int ndarray (n_source,)
-        Vertices of the target.
-    vertices : int ndarray (p,), optional
-        Of the target; all by default.
-
-    Returns
-    -------
-    float ndarray (p,)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import s4a
-    >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])  # a square
-    >>> T = np.array([[0, 1, 2], [0, 2, 3]])
-    >>> rotate = np.array([1, 2, 3, 0])
-    >>> s4a.metrics.bijectivity(X, T, rotate, np.argsort(rotate)).tolist()
-    [0.0, 0.0, 0.0, 0.0]
-    """
-    return cycle_error(X, T, match, reverse, vertices=vertices, limit=limit)
-
-
 def label_accuracy(label: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> float:
     """Return the share of the vertices, or of the area, with the correct label.
 
@@ -361,12 +322,10 @@ def landmark_error(position: ArrayLike, true: ArrayLike) -> np.ndarray:
     return np.linalg.norm(np.asarray(position) - np.asarray(true), axis=-1)
 
 
-def _weighted_median(values, weight):
-    if not len(values):
-        return np.inf
-    order = np.argsort(values)
-    total = np.cumsum(weight[order])
-    return values[order[np.searchsorted(total, total[-1] / 2)]]
+def _median(values, weight):
+    """Weighted median; infinite without values."""
+    weighted = {"weights": weight, "method": "inverted_cdf"}
+    return np.quantile(values, 0.5, **weighted) if len(values) else np.inf
 
 
 def true_positions(truth: ArrayLike, X: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -532,14 +491,14 @@ def evaluate(
         "hausdorff_paper": forth.max() + back.max() / len(image),
         "dirichlet": dirichlet(image / size, *cotan_weights(Y, S)),
         "coverage": coverage(match, area),
-        "conformal_distortion": _weighted_median(conformal[regular], weight[regular]),
-        "area_distortion": _weighted_median(np.abs(growth[regular]), weight[regular]),
+        "conformal_distortion": _median(conformal[regular], weight[regular]),
+        "area_distortion": _median(np.abs(growth[regular]), weight[regular]),
         "collapsed_share": weight[collapsed].sum() / weight.sum(),
     }
     if reverse is not None:
         reverse = _check_match(reverse, source, target, "reverse")
         sample = _evenly_spaced(len(Y), n_geodesic)
-        result["bijectivity"] = bijectivity(Y, S, match, reverse, vertices=sample).mean()
+        result["bijectivity"] = cycle_error(Y, S, match, reverse, vertices=sample).mean()
     coords = {}
     if truth is not None:
         position, vertex = true_positions(truth, X, len(Y))

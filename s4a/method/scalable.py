@@ -195,10 +195,7 @@ def spectral_space(
     mesh: xr.Dataset, sample: Array, cell: Array, U: sp.csr_matrix, k: int = 100
 ) -> Shape:
     """Compute the eigenpairs in the span of U: the second half of :func:`reduce`."""
-    if not 1 <= k < len(sample):
-        raise ValueError(
-            f"k must be from 1 to below the number of samples, {len(sample)}; found {k!r}"
-        )
+    check_count("k", k, 1, len(sample) - 1)
     X, T = as_arrays(mesh)
     X = Shape(mesh).to_frame(X)
     E, w, area, _ = laplacian(X, T, vertex_areas(X, T))

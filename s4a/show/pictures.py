@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
+from s4a.schema import check_count
 from s4a.show.browser import appearance_state, color_scale
 from s4a.show.charts import reach
 from s4a.show.draw import SIGNED, Viewpoint, plane_box, render, rotation, signed_colors
@@ -210,7 +211,7 @@ def write_film(
     """
     path = _checked(path, FILMS, width)
     draw, axis, shared = _source(data, mode, values, label, view, up)
-    _whole("n_frames", n_frames, 2, 10_000)
+    check_count("n_frames", n_frames, 2, 10_000)
     for name, given, more in (
         ("score", score, ""),
         ("reach", reach, ""),
@@ -252,16 +253,10 @@ def _checked(path: Path | str, endings: Iterable[str], width: int) -> Path:
     if path.suffix.lower() not in endings:
         more = "; a panel's Save film writes WebM" if path.suffix == ".webm" else ""
         raise ValueError(f"the file has to end in {' or '.join(endings)}, found {path.name}{more}")
-    _whole("width (pixels)", width, 100, WIDEST)
+    check_count("width (pixels)", width, 100, WIDEST)
     if not path.parent.is_dir():
         raise ValueError(f"the folder {path.parent} does not exist: make it, or give another path")
     return path
-
-
-def _whole(name, given, low, high):
-    """Raise ValueError unless `given` is an integer from `low` to `high`."""
-    if not isinstance(given, int | np.integer) or not low <= given <= high:
-        raise ValueError(f"{name} needs a whole number from {low} to {high}, found {given!r}")
 
 
 def _numbers(name, given):

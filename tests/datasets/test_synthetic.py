@@ -280,7 +280,7 @@ def test_known_surfaces_have_their_area_volume_and_genus():
 
 @pytest.mark.parametrize("call, message", [
     (lambda: synthetic.simulate(0), "at least 1"),
-    (lambda: synthetic.simulate(3, n_modes=9), "from 0 to 6"),
+    (lambda: synthetic.simulate(3, n_modes=9), "at most 6"),
     (lambda: synthetic.brains(1, 3), "at least 4"),
     (lambda: synthetic.position(synthetic.simulate(2), "brain_99", [[0, 0, 1]]), "brain_99"),
 ])  # fmt: skip
