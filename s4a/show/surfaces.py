@@ -84,11 +84,6 @@ def surface(study: xr.DataTree, name: str, stage: str = "coarse") -> tuple[np.nd
     return aligned(study, name, X), T
 
 
-def resolutions(study: xr.DataTree) -> list[tuple[str, str]]:
-    """Return the resolutions of the study as options of a list: text and stage."""
-    return [(text, stage) for text, stage in RESOLUTIONS if has(study, stage)]
-
-
 def unit_text(study: xr.DataTree, name: str) -> str:
     """Return the unit of a shape's positions, from its file or from the modes of variation."""
     node = study["original"].children.get(name) if "original" in study.children else None

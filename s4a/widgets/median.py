@@ -6,7 +6,7 @@ import traitlets
 
 from s4a.method.median import NORMS, distance_to_identity, near_ties
 from s4a.show.browser import PARTS
-from s4a.show.surfaces import labelled, names_of, resolutions, surface
+from s4a.show.surfaces import RESOLUTIONS, has, labelled, names_of, surface
 from s4a.widgets.panel import Panel, columns, dropdown, int_slider, row
 from s4a.widgets.views import Chart
 
@@ -52,7 +52,8 @@ class Median(Panel):
         self.norm = self.redrawing(dropdown("norm", NORM, list(NORMS), value=norm), self.rank)
         size = int_slider("eigenfunctions K", EIGENFUNCTIONS, k, 2, k)
         self.size = self.redrawing(size, self.rank)
-        stages = dropdown("surfaces", "the resolution of the meshes", resolutions(self.study))
+        resolutions = [(text, stage) for text, stage in RESOLUTIONS if has(self.study, stage)]
+        stages = dropdown("surfaces", "the resolution of the meshes", resolutions)
         self.stage = self.redrawing(stages, self.show)
         self.shape = dropdown("shape", "the shape that is shown", options)
         self.bars, self.ties = Chart(), ipywidgets.HTML()
@@ -68,15 +69,6 @@ class Median(Panel):
             self.ties,
             columns(self.bars, self.scene),
         ]
-
-    def selection(self) -> dict:
-        """Return the shape that is shown."""
-        return {"shape": self.selected}
-
-    def adopt(self, pair: tuple[str, str], shape: str) -> None:
-        """Show the shape if it is ranked."""
-        if shape in self.names:
-            self.selected = shape
 
     def rank(self) -> None:
         """Compute the distances for the selected operator, norm and number of eigenfunctions."""

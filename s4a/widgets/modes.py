@@ -160,19 +160,17 @@ class Modes(Panel):
         self.path = file_name("shape.ply")
         mesh_help = "the current shape at full resolution"
         self.ply = self.save_button("Save mesh", lambda: self.save_mesh(self.path.value), mesh_help)
-        page_help = "one HTML file that needs no kernel"
-        self.html = self.save_button(
-            "Save page", lambda: self.save_html(self.page_path()), page_help
-        )
+        page_help = "one HTML file that needs no kernel, with the name of the mesh"
+        self.html = self.save_button("Save page", self.save_page, page_help)
         return [self.view, row(self.resolution, self.path, self.ply, self.html)]
 
     def arrays(self, resolution: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return mean shape, triangles and deformations at a resolution."""
         return mode_arrays(self.study, None if resolution == "full" else self.coarse, self.n_modes)
 
-    def page_path(self) -> Path:
-        """Return the path of the page, which has the name of the mesh."""
-        return Path(self.path.value).with_suffix(".html")
+    def save_page(self) -> Path:
+        """Save a page with the name of the mesh."""
+        return self.save_html(Path(self.path.value).with_suffix(".html"))
 
     def vertices(self, resolution: str = "full") -> np.ndarray:
         """Return the vertices ``(n, 3)`` of the current shape, in the unit of the input."""

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import anywidget
 import ipywidgets
@@ -16,7 +17,7 @@ from s4a.show.browser import FRAME, PARTS, STYLE
 from s4a.show.draw import Viewpoint
 from s4a.show.panel_page import LIMIT, panel_html, widgets_in
 from s4a.show.surfaces import has
-from s4a.widgets.views import Scene, camera_group
+from s4a.widgets.views import Scene
 
 log = logging.getLogger(__name__)
 WIDE = {"width": "26em"}
@@ -174,7 +175,9 @@ class Panel(KernelWidget):
     clicks = ()  # chart, key of the clicked mark, and the control that a click sets
     every = ()  # sliders of which all values are recorded, not only two dozen
     python = ()  # other actions that need Python
-    shares = ()  # traits that name the selected pair or shape, for the other tabs
+    # traits that name the selected pair or shape, for the other tabs; a single one is of `names`
+    shares: tuple[str, ...] = ()
+    names: list[str] = []  # noqa: RUF012, of the shapes that can be selected
     scenes: list[Scene] = []  # noqa: RUF012, views that are updated together
     recording = False  # while the values of the controls are recorded for a saved page
 
@@ -197,7 +200,8 @@ class Panel(KernelWidget):
         super().__init__(layout=panel_layout(width))
         self.add_class("s4a-panel")  # in style.css
         self.study = study
-        self.camera: dict[str, Any] = {"group": camera_group(), "view": view, "up": up}
+        # views of one group rotate together
+        self.camera: dict[str, Any] = {"group": uuid4().hex, "view": view, "up": up}
         self.frame = Frame(title=self.title, font=font or 0.0)
         self.message, self.failed = ipywidgets.HTML(), False
         self.children = [self.frame, *self.build(**options), self.message]
@@ -231,10 +235,12 @@ class Panel(KernelWidget):
 
     def selection(self) -> dict[str, Any]:
         """Return the selected ``pair`` (source, target) and ``shape``, by name."""
-        return {}
+        return {"shape": getattr(self, *self.shares)}
 
     def adopt(self, pair: tuple[str, str], shape: str) -> None:
         """Show the pair or shape selected in another tab, if the panel has it; "" for none."""
+        if self.shares and shape in self.names:
+            self.set_trait(*self.shares, shape)
 
     def control(self, name: str) -> ipywidgets.Widget:
         """Return the control of a name in `live`."""

@@ -70,15 +70,6 @@ class Spectrum(Panel):
         charts = columns(self.curves, self.residuals)
         return [row(self.choice), charts, columns(function, surface_of_k)]
 
-    def selection(self) -> dict:
-        """Return the shape whose functions are shown."""
-        return {"shape": self.shape}
-
-    def adopt(self, pair: tuple[str, str], shape: str) -> None:
-        """Show the eigenfunctions of the shape, if it has any."""
-        if shape in self.names:
-            self.shape = shape
-
     def pick(self, mark: dict) -> None:
         """Select the shape of the clicked curve."""
         if mark["series"] in self.names:

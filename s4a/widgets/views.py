@@ -5,7 +5,6 @@ gets a still picture of the surface at every change.
 """
 
 from typing import Any
-from uuid import uuid4
 
 import anywidget
 import numpy as np
@@ -72,11 +71,6 @@ def signed_limit(values: np.ndarray) -> float:
     2.0
     """
     return float(np.quantile(np.abs(values), 0.99))
-
-
-def camera_group() -> str:
-    """Return a unique name: the views of one panel share it, and so rotate together."""
-    return uuid4().hex
 
 
 class View(anywidget.AnyWidget):
