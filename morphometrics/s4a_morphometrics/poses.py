@@ -28,6 +28,7 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from s4a.analysis.inputs import registration_of
+from s4a.analysis.permutation import check_permutations
 from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
@@ -36,7 +37,7 @@ from s4a.input.coordinates import file_system, map_between, moved
 from s4a.input.subjects import listed
 from s4a.method.pca import center_gram, gram, pca, principal_components
 from s4a.options import MILLIMETRES
-from s4a.schema import check_count, check_switch, covariate, dataset, in_unit, unit_of
+from s4a.schema import check_switch, covariate, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 from s4a.study.insert import scores_of_new
 from s4a_morphometrics.several import of_structure, structure_names, subject_systems
@@ -276,7 +277,7 @@ def structures(
     (1.0, 6)
     """
     seed = seed_of(seed, rng)
-    check_count("n_permutations", n_permutations, 1)
+    check_permutations(n_permutations)
     check_switch("remove_size", remove_size)
     names = structure_names(study)
     registered = {name: registration_of(of_structure(study, name)) for name in names}

@@ -14,7 +14,7 @@ import xarray as xr
 
 from s4a.analysis.effects import modes_study
 from s4a.analysis.inputs import Values, registration_of
-from s4a.analysis.permutation import design, p_values
+from s4a.analysis.permutation import check_permutations, design, p_values
 from s4a.method.pca import gram, principal_components
 from s4a.schema import FIELD_UNIT, check_count, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
@@ -175,7 +175,7 @@ def covariation(
     (True, ('component', 'vertex'))
     """
     seed = seed_of(seed, rng)
-    check_count("n_permutations", n_permutations, 1)
+    check_permutations(n_permutations)
     no_values = np.zeros(registration_of(study).sizes["shape"])
     blocks = field_sample(study, field, no_values, "", covariates)
     sample = blocks.sample

@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 # a DataArray with the coordinate shape; or the name of a column of /subjects.
 Values = np.ndarray | Sequence[Any] | dict[str, Any] | str
 
+KINDS = {"M": "dates", "m": "durations", "O": "a mixture", "c": "complex numbers"}
 DATE = re.compile(r"\d{4}-\d\d?-\d\d?.*|\d{4}/\d\d?/\d\d?|\d\d?[./-]\d\d?[./-](\d\d){1,2}")
 IDENTIFIER = re.compile(r"(\b|_)(id|nr|code)'?$", re.IGNORECASE)  # end of a column's name
 
@@ -274,7 +275,8 @@ def _in_order(values, names, what):
 def _plain(values, names, what):
     """Convert values to numbers, finite or NaN, or text."""
     if values.dtype.kind == "O":
-        missing = np.array([_is_none(value) for value in values.ravel()]).reshape(values.shape)
+        missing = [x is None or str(x) == "NaT" or is_missing(str(x)) for x in values.ravel()]
+        missing = np.reshape(np.array(missing, bool), values.shape)
         kinds = {np.asarray(value).dtype.kind for value in values[~missing].tolist()}
         if kinds <= set("iufb"):
             values = np.where(missing, np.nan, values).astype(float)
@@ -282,8 +284,9 @@ def _plain(values, names, what):
             values = np.where(missing, "", values).astype(str)
     if values.dtype.kind not in "iufbUS":
         raise ValueError(
-            f"{what} needs only numbers or only text; found {_kind(values)}: give a date as a "
-            "number, such as years since the first"
+            f"{what} needs only numbers or only text; found "
+            f"{KINDS.get(values.dtype.kind, values.dtype)}: give a date as a number, such as years "
+            "since the first"
         )
     if values.dtype.kind in "US":
         cells = [cell.strip() for cell in values.astype(str).ravel().tolist()]
@@ -300,17 +303,6 @@ def _plain(values, names, what):
             f"{listed(np.array(names)[infinite].tolist())}"
         )
     return values
-
-
-def _is_none(value):
-    """Whether an object is a missing value: None, NaN, NA of pandas, or text."""
-    return value is None or str(value) in ("nan", "<NA>", "NaT") or is_missing(str(value))
-
-
-def _kind(values):
-    return {"M": "dates", "m": "durations", "O": "a mixture", "c": "complex numbers"}.get(
-        values.dtype.kind, str(values.dtype)
-    )
 
 
 def _column(study, name, what):

@@ -13,6 +13,7 @@ from scipy import stats
 from scipy.linalg.lapack import dlasd4
 
 from s4a.analysis.inputs import displacements_of
+from s4a.analysis.permutation import check_permutations
 from s4a.geometry.closest import distance_to_surface
 from s4a.geometry.mesh import as_arrays
 from s4a.method.deform import smoother
@@ -350,7 +351,7 @@ def evaluate(
     >>> bool(quality["generalization"][0] > quality["generalization"][3])
     True
     """
-    check_count("n_permutations", n_permutations, 1)
+    check_permutations(n_permutations)
     check_count("n_samples", n_samples, 2)
     check_count("n_points", n_points)
     check_count("n_surface", n_surface, 2)

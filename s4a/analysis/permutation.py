@@ -27,9 +27,14 @@ log = logging.getLogger(__name__)
 INFLATED, MOST_INFLATED = 10.0, 1e4
 
 
+def check_permutations(n_permutations: int) -> None:
+    """Raise ValueError unless a number of permutations is from 1 to 10 million."""
+    check_count("n_permutations", n_permutations, 1, 10_000_000)
+
+
 def check_options(n_permutations: int, variances: str, seed: int) -> dict[str, Any]:
     """Return the options of a :class:`Model` after a check."""
-    check_count("n_permutations", n_permutations, 1)
+    check_permutations(n_permutations)
     check_choice("variances", variances, ("equal", "unequal"))
     return {"n_permutations": n_permutations, "variances": variances, "seed": seed}
 

@@ -29,7 +29,7 @@ from s4a.analysis.inputs import (
     with_flagged,
 )
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
-from s4a.analysis.permutation import Model, indicators
+from s4a.analysis.permutation import Model, check_permutations, indicators
 from s4a.method.pca import gram, principal_components
 from s4a.schema import check_count, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
@@ -222,7 +222,7 @@ def classify_sample(
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
-    check_count("n_permutations", n_permutations, 1)
+    check_permutations(n_permutations)
     check_count("n_folds", n_folds, 2)
     group, sizes = sample.values, group_sizes(sample.values)
     names, count = np.unique(group, return_counts=True)

@@ -595,7 +595,8 @@ def compare(
         found = result["metrics"].to_dataset() if keep else result
         names = found["algorithm"].values.tolist()
         seconds = found["block_seconds"].mean("pair").values
-        blocks = tables.block_table(names, found["block"].values.tolist(), seconds)
+        rows = [[name, *row, row.sum()] for name, row in zip(names, seconds, strict=True)]
+        blocks = tables.table(rows, ["CPU s", *found["block"].values.tolist(), "all"], ".1f")
         text = f"{tables.comparison_table(found)}\n\n{blocks}"
     folder = new_folder(out)
     result.to_netcdf(folder / "compare.nc", engine="h5netcdf")

@@ -526,12 +526,6 @@ def comparison_table(pairs: "xr.Dataset") -> str:
     return table(rows, ["method", "CPU s", *(title for title, *_ in columns.values())])
 
 
-def block_table(methods: Sequence[str], blocks: Sequence[str], seconds: "np.ndarray") -> str:
-    """Return the CPU seconds (m, b) of every method by block (Fig. 3)."""
-    rows = [[method, *row, row.sum()] for method, row in zip(methods, seconds, strict=True)]
-    return table(rows, ["CPU s", *blocks, "all"], ".1f")
-
-
 def collection_table(result: "xr.Dataset") -> str:
     """Return Table 2: mean Chamfer distance to the template, CPU seconds, median shape."""
     rows = []

@@ -205,17 +205,6 @@ def _correlation_transferred(pair, field):
     return np.corrcoef(np.asarray(transferred), field.parts["right"])[0, 1]
 
 
-def _directional_share(asymmetries):
-    """Return the share of directional asymmetry in the variance within individuals."""
-    _, sides, rest = asymmetries["sum_of_squares"].values
-    return sides / (sides + rest)
-
-
-def _displacement_by_age(fit, years):
-    """Return the largest displacement of a vertex over some years."""
-    return years * np.linalg.norm(fit["effect"].values, axis=1).max()
-
-
 # The right answer, or a function of the arguments that follow the answer in the cell.  It returns
 # the right answer, or a function of the answer that returns True if the answer is right.
 EXERCISES: dict[str, Any] = {
@@ -278,7 +267,7 @@ EXERCISES: dict[str, Any] = {
     "12.2": lambda test: (
         np.mean(test["p_vertex"].values < 0.05) - np.mean(test["p_family_wise"].values < 0.05)
     ),
-    "12.3": lambda fit: _displacement_by_age(fit, 10),
+    "12.3": lambda fit: 10 * np.linalg.norm(fit["effect"].values, axis=1).max(),
     "13.1": lambda report: report["shape"].values[report["status"].values != "ok"].tolist(),
     "13.2": lambda image: (
         (np.asarray(image.dataobj) == 1).sum() * abs(np.linalg.det(image.affine)) / 1000
@@ -290,7 +279,7 @@ EXERCISES: dict[str, Any] = {
         *(v[confidence <= np.median(confidence)] for v in (field, own))
     )[0, 1],
     "15.1": 6,
-    "15.2": _directional_share,
+    "15.2": lambda a: a["sum_of_squares"].values[1] / a["sum_of_squares"].values[1:].sum(),
     "15.3": lambda asymmetries: asymmetries["fluctuating_size"].idxmax().item(),
     "16.1": lambda half, truth: np.linalg.norm(half["position"] - truth, axis=1)[
         half["present"].values == 1

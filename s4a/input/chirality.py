@@ -87,7 +87,8 @@ def mean_chirality(comparisons: Mapping[str, xr.Dataset]) -> np.ndarray:
     # a reference that is not among the shapes has the sign that they agree on
     reference_sign = np.where(np.nan_to_num(chirality.T) @ sign < 0, -1, 1)
     reference_sign[is_shape] = sign[index]
-    mean = _mean(chirality * reference_sign)
+    known = np.isfinite(chirality).sum(1)
+    mean = np.nansum(chirality * reference_sign, axis=1) / np.maximum(known, 1)
     negative, positive = (mean < 0).sum(), (mean > 0).sum()
     return -mean if (negative, mean[0] < 0) > (positive, mean[0] > 0) else mean
 
@@ -114,11 +115,6 @@ def signs(similarity: np.ndarray) -> np.ndarray:
     leading = np.linalg.eigh(symmetric)[1][:, -1]
     sign = np.where(leading < 0, -1, 1)
     return sign * sign[0]
-
-
-def _mean(chirality):
-    is_known = np.isfinite(chirality)
-    return np.where(is_known, chirality, 0).sum(1) / np.maximum(is_known.sum(1), 1)
 
 
 def fits_mirrored(

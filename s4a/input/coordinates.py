@@ -376,8 +376,3 @@ def _of_gifti(data):
     if len({s.axes for s in found}) == 1 and np.ptp(numbers, axis=0).max() < 1e-3:
         return found[-1]
     return CoordinateSystem("RAS", UNKNOWN, "mm")  # nothing, or two that differ
-
-
-def nifti_system(code: int) -> CoordinateSystem:
-    """Return the system of the affine map of a NIfTI or MGH volume, by NIfTI's code."""
-    return CoordinateSystem("RAS", XFORMS.get(code, ""), "mm")

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import sparse
 
 from s4a.geometry.mesh import directed_edges
-from s4a.input.coordinates import AXES, UNKNOWN, CoordinateSystem, map_to_ras, nifti_system
+from s4a.input.coordinates import AXES, UNKNOWN, XFORMS, CoordinateSystem, map_to_ras
 from s4a.input.formats import PLY_TYPES
 from s4a.input.raw import check_there, content, gunzip, reading
 from s4a.options import MILLIMETRES, check_label
@@ -115,7 +115,9 @@ def grid_of(data: bytes) -> tuple[tuple[int, ...], np.ndarray, CoordinateSystem]
     header = kind.header_class.from_fileobj(io.BytesIO(data))
     affine, is_oriented = _affine_of(header, name)
     codes = [0, 2] if name == "MGH" else [int(header[f"{form}form_code"]) for form in "qs"]
-    system = nifti_system(codes[1] or codes[0]) if is_oriented else CoordinateSystem(unit="mm")
+    system = CoordinateSystem(unit="mm")
+    if is_oriented:
+        system = CoordinateSystem("RAS", XFORMS.get(codes[1] or codes[0], ""), "mm")
     if name == "MGH" and data[28:30] == b"\0\0":  # goodRASFlag: nibabel makes up directions
         system = replace(system, origin=UNKNOWN)
     return _shape_of(header), affine, system

@@ -549,7 +549,9 @@ def _genus(attrs, remarks):
     count = Counter(genus.values())
     if len(count) < 2:
         return
-    remarks.append(f"the shapes differ in genus ({_names_by(genus, 'genus ')})")
+    names = {g: first_of([n for n in genus if genus[n] == g], most=6) for g in sorted(count)}
+    listed = "; ".join(f"genus {g}: {of_genus}" for g, of_genus in names.items())
+    remarks.append(f"the shapes differ in genus ({listed})")
     usual, number = count.most_common(1)[0]
     for name, g in genus.items():
         if g != usual and number > len(genus) / 2:
@@ -634,12 +636,6 @@ def _forms(comparisons, flags):
         is_explained = any(flag.kind in ("partial", "duplicate") for flag in flags[name])
         if deviations > WARNED and not is_explained:
             yield name, flag("kind", deviations > FLAGGED, what=what, deviations=deviations)
-
-
-def _names_by(values, prefix=""):
-    """Shapes of each value: ``m: a; mm: b, c``."""
-    groups = {v: [name for name in values if values[name] == v] for v in set(values.values())}
-    return "; ".join(f"{prefix}{v}: {first_of(groups[v], most=6)}" for v in sorted(groups))
 
 
 class Decision(NamedTuple):

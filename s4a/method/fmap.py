@@ -434,12 +434,10 @@ def fmap_from_landmarks(
     target: Basis,
     landmark_source: Array,
     landmark_target: Array,
-    *,
-    commute: float = LAPLACIAN,
 ) -> Array:
     """Fit a functional map to heat kernels around landmark pairs (step 4 of 4.1).
 
-    :func:`fit` with the :func:`landmark_descriptors` and the penalty commute |F|^2 (mu_i -
+    :func:`fit` with the :func:`landmark_descriptors` and the penalty 0.001 |F|^2 (mu_i -
     lambda_j)^2 / lambda_max^2.
 
     Parameters
@@ -454,14 +452,12 @@ def fmap_from_landmarks(
     C : float ndarray (k, k)
     """
     F, G = landmark_descriptors(source, target, landmark_source, landmark_target)
-    return fit_to_landmarks(source, target, F, G, commute=commute)
+    return fit_to_landmarks(source, target, F, G)
 
 
-def fit_to_landmarks(
-    source: Basis, target: Basis, F: Array, G: Array, *, commute: float = LAPLACIAN
-) -> Array:
+def fit_to_landmarks(source: Basis, target: Basis, F: Array, G: Array) -> Array:
     """Fit a functional map ``(k, k)`` to the :func:`landmark_descriptors` F and G."""
-    penalty = commute * np.trace(F @ F.T) * _commutator(source.eigenvalue, target.eigenvalue)
+    penalty = LAPLACIAN * np.trace(F @ F.T) * _commutator(source.eigenvalue, target.eigenvalue)
     return fit(F, G, penalty=penalty, constant=_constant_to_constant(source, target))
 
 
@@ -629,14 +625,8 @@ def curvature_difference(source: Basis, target: Basis, match: Array) -> float:
 
 def curvatures(basis: Basis) -> list[Array]:
     """Return signed mean curvatures ``(n,)`` for the numbers of functions :data:`SCALES`."""
-    X, normals, area, Phi, eigenvalue = (
-        basis.X,
-        basis.normals,
-        basis.area,
-        basis.Phi,
-        basis.eigenvalue,
-    )
-    return [mean_curvature(X, normals, area, Phi[:, :k], eigenvalue[:k]) for k in SCALES]
+    surface = basis.X, basis.normals, basis.area
+    return [mean_curvature(*surface, basis.Phi[:, :k], basis.eigenvalue[:k]) for k in SCALES]
 
 
 def orthogonality_error(C: Array) -> float:

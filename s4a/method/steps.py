@@ -496,12 +496,6 @@ def basis_in(study: Study, name: str) -> Basis:
     return Shape(coarse=study[f"coarse/{name}"]).low
 
 
-def options_of_registration(study: xr.DataTree) -> dict[str, Any]:
-    """Return the options of registration that the report of a study names."""
-    check_type(study, xr.DataTree)
-    return {name: v for name, v in kept_options(study).items() if name in REGISTRATION}
-
-
 def template_of(study: xr.DataTree) -> str:
     """Return the name of the template of a study; the median shape if nothing is registered yet."""
     if "registration" in study and "template" in study["registration"].attrs:
@@ -697,7 +691,6 @@ def register_shape(
     template: str | None = None,
     *,
     initial_transform: RigidTransform | None = None,
-    dense_match: str | None = None,
     **options: Any,
 ) -> xr.Dataset:
     """Register one shape of a study to the template (4.2; eq. 6, 7 and 8).
@@ -715,11 +708,8 @@ def register_shape(
         Approximate rigid transform R x + t of the shape onto the template.  Both are centred and
         scaled to unit area.  The default is the alignment of the network, or ICP from the principal
         axes if there is none.
-    dense_match : {"latent", "fmap"}, optional
-        Match by the latent bases (eq. 7), or by functional maps (eq. 3 and 4).  By default as in
-        the report of the study.
     **options
-        Those of :class:`s4a.Options` for registrations, such as ``refine`` and ``remove_size``;
+        Those of :class:`s4a.Options` for registrations, such as ``dense_match`` and ``refine``;
         the message about another one lists them.  Options that are missing or None have the values
         in the report of the study, or their defaults if there is no report.
 
@@ -776,14 +766,9 @@ def register_shape(
             f"unexpected options {', '.join(unknown)}; those of a registration are "
             f"{', '.join(REGISTRATION)}"
         )
-    given = {
-        key: value
-        for key, value in (options | {"dense_match": dense_match}).items()
-        if value is not None
-    }
-    options = options_of_registration(study) | given
-    for option in options.keys() & {"refine", "alignment", "displacement_alignment", "dense_match"}:
-        check(option, options[option])
+    check_type(study, xr.DataTree)
+    kept = {name: value for name, value in kept_options(study).items() if name in REGISTRATION}
+    options = kept | {name: check(name, v) for name, v in options.items() if v is not None}
     projection = {key: options.pop(key) for key in PROJECTION if key in options}
     template = template_of(study) if template is None else template
     target = shape_in(Study(study), template, **projection)

@@ -256,8 +256,6 @@ def network(
     target: np.ndarray,
     errors: dict[str, np.ndarray],
     highlight: int | None = None,
-    *,
-    limits: tuple[float, float] | None = None,
 ) -> Figure:
     """Draw the network of maps once for each array of edge errors, on one logarithmic scale.
 
@@ -272,9 +270,6 @@ def network(
         Title of each picture, and the errors that colour its edges; NaN is grey.
     highlight : int, optional
         Index of a node to mark.
-    limits : (float, float), optional
-        Ends of the scale (:func:`s4a.show.draw.cycle_error_limits`); by default those of all
-        `errors`.
 
     Returns
     -------
@@ -290,7 +285,7 @@ def network(
     <Figure ...>
     """
     figure, (axes,) = _figure(4.6 * len(errors) + 0.6, 4.2, len(errors))
-    limits = limits or cycle_error_limits(*errors.values())
+    limits = cycle_error_limits(*errors.values())
     edges = np.stack([positions[source], positions[target]], axis=1)  # (pair, 2, 2)
     for ax, (title, value) in zip(axes, errors.items(), strict=True):
         order = np.argsort(np.nan_to_num(value, nan=-1))  # the largest on top, unknown below
@@ -314,22 +309,13 @@ def network(
     return figure
 
 
-def matrices(
-    named: dict[str, np.ndarray],
-    limit: float = 1.0,
-    *,
-    axes: tuple[str, str] = ("eigenfunction of the source", "eigenfunction of the target"),
-) -> Figure:
-    """Draw matrices side by side with signed colours, blue positive.
+def matrices(named: dict[str, np.ndarray]) -> Figure:
+    """Draw functional maps side by side with signed colours from -1 to 1, blue positive.
 
     Parameters
     ----------
     named : dict of str to float ndarray (rows, columns)
         Title of each matrix and its entries.
-    limit : float
-        Absolute value at the ends of the scale.
-    axes : (str, str)
-        Labels of the columns and of the rows.
 
     Returns
     -------
@@ -345,8 +331,9 @@ def matrices(
     """
     figure, (frames,) = _figure(3.4 * len(named) + 0.7, 3.3, len(named))
     for ax, (title, values) in zip(frames, named.items(), strict=True):
-        image = ax.imshow(values, cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest")
-        ax.set(title=title, xlabel=axes[0], ylabel=axes[1])
+        image = ax.imshow(values, cmap=SIGNED, vmin=-1, vmax=1, interpolation="nearest")
+        ax.set(title=title, xlabel="eigenfunction of the source")
+        ax.set_ylabel("eigenfunction of the target")
         for axis in (ax.xaxis, ax.yaxis):
             axis.set_major_locator(MaxNLocator(5, integer=True))
     figure.colorbar(image, ax=list(frames), shrink=0.8, pad=0.01)
