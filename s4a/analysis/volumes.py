@@ -97,9 +97,12 @@ def write_label_volumes(
     # before any file is written
     grids = {name: _grid_of(study, name, grid) for name in names}
     given = CoordinateSystem.of({"coordinate_system": coordinate_system, "unit": unit})
-    maps = {
-        name: _map_to(grids[name][0], study["original"][name].attrs, given, name) for name in names
-    }
+    maps = {}
+    for name, (volume, _) in grids.items():
+        attrs = study["original"][name].attrs
+        file, system = file_system(attrs).filled(given), read_grid(volume)[2]
+        what = f"{name}, to be written in {volume},"
+        maps[name] = map_between(file, system, what) @ map_to_file(attrs)
     transferred = transfer_labels(study, label, targets=names)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -128,13 +131,6 @@ def _grid_of(study, name, grid):
             "(--grid FILE)"
         )
     return attrs["path"], attrs["label"]
-
-
-def _map_to(grid, attrs, given, name):
-    """Map (4, 4) of a mesh, which the run may have mirrored or converted, to a volume."""
-    file = file_system(attrs).filled(given)
-    system = read_grid(grid)[2]
-    return map_between(file, system, f"{name}, to be written in {grid},") @ map_to_file(attrs)
 
 
 def _volume(mesh, M, name, label, grid, source_label):

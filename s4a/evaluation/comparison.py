@@ -35,7 +35,7 @@ from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.collection import Mesh, as_mesh, read_shapes
 from s4a.input.coordinates import in_one_system
 from s4a.input.landmarks import locate
-from s4a.input.raw import content, npy, shown, text_of
+from s4a.input.raw import content, npy, reading, text_of
 from s4a.method import latent, median, network
 from s4a.method.alignment import IDENTITY, pair_transform, transform_onto
 from s4a.method.initial_map import map_after_alignment
@@ -126,15 +126,10 @@ def read_ground_truth(path: Path | str) -> np.ndarray:
 
     NPY, or text with one or three numbers in each row.
     """
-    try:
-        data = content(path)
-        delimiter = "," if str(path).endswith(".csv") else None
-        as_text = not str(path).endswith(".npy")
-        truth = (
-            np.loadtxt(io.StringIO(text_of(data)), delimiter=delimiter) if as_text else npy(data)
-        )
-    except ValueError as error:
-        raise ValueError(f"{shown(path)} cannot be read as truth: {shown(error)}") from error
+    with reading(path, "truth"):
+        data, mark = content(path), "," if str(path).endswith(".csv") else None
+        is_npy = str(path).endswith(".npy")
+        truth = npy(data) if is_npy else np.loadtxt(io.StringIO(text_of(data)), delimiter=mark)
     whole = truth.ndim == 1 and np.array_equal(truth, np.round(truth))
     return truth.astype(np.int64) if whole else truth
 
@@ -285,7 +280,9 @@ def compare(
     table = table.assign_attrs(options | {"n_coarse": n_coarse, "seed": seed} | joint_note(notes))
     if not keep:
         return table
-    return xr.DataTree.from_dict({"metrics": table, "source": without_coords(M.mesh), **nodes})
+    return xr.DataTree.from_dict(
+        {"metrics": table, "source": M.mesh.drop_vars(M.mesh.coords), **nodes}
+    )
 
 
 def note_on_k(k: int, least: int) -> dict[str, str]:
@@ -301,11 +298,6 @@ def joint_note(notes: Mapping[str, str]) -> dict[str, str]:
         return {}
     log.warning("%s", note)
     return {"note": note}
-
-
-def without_coords(mesh: xr.Dataset) -> xr.Dataset:
-    """Return a mesh without the coordinates that it inherited from a tree."""
-    return mesh.drop_vars(list(mesh.coords))
 
 
 def with_results(
@@ -344,7 +336,7 @@ def with_results(
         errors = np.linalg.norm(np.stack(images) - true, axis=2) / np.sqrt(vertex_areas(X, T).sum())
         variables |= {"true_position": true, "true_match": vertex.astype(np.int32)}
         variables["algorithm_error"] = errors.astype(np.float32)
-    mesh = without_coords(target).merge(dataset(None, **variables))
+    mesh = target.drop_vars(target.coords).merge(dataset(None, **variables))
     return mesh.assign_coords(algorithm=list(outcomes))
 
 

@@ -118,19 +118,15 @@ def _gifti_vector(data, intent="LABEL"):
     return found[0]
 
 
-class _Cursor:
+class _Cursor(io.BytesIO):
     """Reader of consecutive big-endian integers and length-prefixed texts."""
-
-    def __init__(self, data):
-        self.data, self.at = data, 0
 
     def take(self, count):
         """Read the next bytes."""
-        rest = len(self.data) - self.at
+        rest = len(self.getbuffer()) - self.tell()
         if not 0 <= count <= rest:
             raise ValueError(f"expected {count} bytes, found {rest}: the file is cut short")
-        self.at += count
-        return self.data[self.at - count : self.at]
+        return self.read(count)
 
     def numbers(self, count):
         return np.frombuffer(self.take(4 * count), ">i4").astype(np.int64)
