@@ -22,7 +22,7 @@ from s4a.input.coordinates import (
     turned,
 )
 from s4a.input.files import write_mesh
-from s4a.schema import check_choice
+from s4a.schema import Array, check_choice
 from s4a.study import store
 
 FORMATS = {"ply": ".ply", "vtk": ".vtk", "obj": ".obj", "npz": ".npz", "gifti": ".gii"}
@@ -147,7 +147,7 @@ def system_of_template(study: xr.DataTree, name: str) -> CoordinateSystem:
 
 def map_to_scan(
     study: xr.DataTree, name: str, given: CoordinateSystem | None = None, unit: str = ""
-) -> tuple[np.ndarray, CoordinateSystem]:
+) -> tuple[Array, CoordinateSystem]:
     """Return the map (4, 4) of a shape to its file, or to scanner RAS, and that system.
 
     Parameters

@@ -22,14 +22,14 @@ from s4a.input.subjects import (
 )
 from s4a.method.pca import pca_without
 from s4a.options import Options, kept_options, with_options
-from s4a.schema import check_type, require, unit_of
+from s4a.schema import Array, check_type, require, unit_of
 from s4a.study.tree import left_out
 
 log = logging.getLogger(__name__)
 
 # One value per shape: in the order of the study; by name of the shape in a dict, a pandas object or
 # a DataArray with the coordinate shape; or the name of a column of /subjects.
-Values = np.ndarray | Sequence[Any] | dict[str, Any] | str
+Values = Array | Sequence[Any] | dict[str, Any] | str
 
 KINDS = {"M": "dates", "m": "durations", "O": "a mixture", "c": "complex numbers"}
 DATE = re.compile(r"\d{4}-\d\d?-\d\d?.*|\d{4}/\d\d?/\d\d?|\d\d?[./-]\d\d?[./-](\d\d){1,2}")
@@ -45,10 +45,10 @@ class Sample(NamedTuple):
     """
 
     registration: xr.Dataset
-    d: np.ndarray
-    area: np.ndarray
-    values: np.ndarray
-    Z: np.ndarray | None
+    d: Array
+    area: Array
+    values: Array
+    Z: Array | None
     attributes: dict[str, str]
     unit: str
 
@@ -58,7 +58,7 @@ def sample_of(
     values: Values,
     what: str,
     covariates: Values | dict[str, Values] | list[str] | None = None,
-    needed: dict[str, np.ndarray] | None = None,
+    needed: dict[str, Array] | None = None,
 ) -> Sample:
     """Return the data of the shapes with all values; others are excluded, with a warning.
 
@@ -177,7 +177,7 @@ def with_flagged(study: xr.DataTree) -> xr.DataTree:
     return xr.DataTree.from_dict(nodes, name=study.name)
 
 
-def displacements_of(study: xr.DataTree) -> tuple[xr.Dataset, np.ndarray, np.ndarray]:
+def displacements_of(study: xr.DataTree) -> tuple[xr.Dataset, Array, Array]:
     """Return registration, displacements ``(s, n, 3)``, and vertex areas of sum 1 ``(n,)``.
 
     Flagged shapes are excluded, with a warning.
@@ -210,7 +210,7 @@ def displacements_of(study: xr.DataTree) -> tuple[xr.Dataset, np.ndarray, np.nda
     return registration, d, area / area.sum()
 
 
-def values_of(study: xr.DataTree, values: Values, what: str) -> np.ndarray:
+def values_of(study: xr.DataTree, values: Values, what: str) -> Array:
     """Return one value or row per shape in the order of the study; errors call them `what`.
 
     Returns
@@ -275,8 +275,8 @@ def _in_order(values, names, what):
 def _plain(values, names, what):
     """Convert values to numbers, finite or NaN, or text."""
     if values.dtype.kind == "O":
-        missing = [x is None or str(x) == "NaT" or is_missing(str(x)) for x in values.ravel()]
-        missing = np.reshape(np.array(missing, bool), values.shape)
+        marks = [x is None or str(x) == "NaT" or is_missing(str(x)) for x in values.ravel()]
+        missing = np.reshape(np.array(marks, bool), values.shape)
         kinds = {np.asarray(value).dtype.kind for value in values[~missing].tolist()}
         if kinds <= set("iufb"):
             values = np.where(missing, np.nan, values).astype(float)
@@ -318,13 +318,13 @@ def _column(study, name, what):
     return {shape: rows.get(shape) for shape in all_registered(study)["shape"].values.tolist()}
 
 
-def lacks_value(values: np.ndarray) -> np.ndarray:
+def lacks_value(values: Array) -> Array:
     """Return a mask of the shapes ``(s,)`` with a missing value."""
     missing = values == "" if values.dtype.kind == "U" else np.isnan(values.astype(float))
     return missing.reshape(len(values), -1).any(axis=1)
 
 
-def group_sizes(group: np.ndarray) -> str:
+def group_sizes(group: Array) -> str:
     """Return the sizes of groups in words, with a warning for groups under 10 shapes.
 
     Raises ValueError if there is only one group, or one has fewer than 3 shapes.
@@ -347,7 +347,7 @@ def group_sizes(group: np.ndarray) -> str:
 
 def covariates_of(
     study: xr.DataTree, covariates: Values | dict[str, Values] | list[str] | None
-) -> dict[str, np.ndarray]:
+) -> dict[str, Array]:
     """Return the covariates by name, with values ``(shape,)`` or ``(shape, c)``."""
     if covariates is None:
         return {}
@@ -368,7 +368,7 @@ def covariates_of(
     return columns
 
 
-def columns_of(covariates: dict[str, np.ndarray]) -> tuple[np.ndarray | None, str]:
+def columns_of(covariates: dict[str, Array]) -> tuple[Array | None, str]:
     """Return covariates as columns of numbers ``(s, c)``, text as indicators, and in words.
 
     Warns about columns that are constant, nearly a combination of others, or number the shapes.
@@ -414,7 +414,7 @@ def columns_of(covariates: dict[str, np.ndarray]) -> tuple[np.ndarray | None, st
     return Z, ", ".join(words)
 
 
-def numbers_shapes(name: str, values: np.ndarray) -> bool:
+def numbers_shapes(name: str, values: Array) -> bool:
     """Return whether a column seems to number the shapes.
 
     Its integers are distinct, and consecutive or called identifiers.
@@ -447,7 +447,7 @@ def _indicators_of(values, name):
     return groups.tolist(), numbers
 
 
-def redundant(Z: np.ndarray, names: list[str], terms: ArrayLike | None = None) -> list[str]:
+def redundant(Z: Array, names: list[str], terms: ArrayLike | None = None) -> list[str]:
     """List the columns ``(s, c)`` that are constant or combinations of earlier ones, in words.
 
     Columns of one term ``(c,)``, such as indicators of the same groups, may be correlated.

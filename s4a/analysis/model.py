@@ -19,15 +19,15 @@ from s4a.geometry.mesh import as_arrays
 from s4a.method.deform import smoother
 from s4a.method.pca import center_gram, gram, principal_components, synthesize
 from s4a.method.shape import Shape
-from s4a.schema import check_count, check_type, dataset, in_unit, unit_of
+from s4a.schema import Array, check_count, check_type, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
 KEPT = "kept from the whole collection: optimistic"
 
 
 def describe_by_others(
-    inner: np.ndarray, cross: np.ndarray, squared_norm: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    inner: Array, cross: Array, squared_norm: float
+) -> tuple[Array, Array, Array]:
     """Reconstruct a field by the model of other fields.
 
     Parameters
@@ -66,7 +66,7 @@ def describe_by_others(
     )
 
 
-def leave_one_out(K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def leave_one_out(K: Array) -> tuple[Array, Array]:
     """Reconstruct every field by the model of all others, see :func:`describe_by_others`.
 
     The scatter of the others is a rank-one downdate of that of all, S - s / (s - 1) x x^T with the
@@ -104,7 +104,7 @@ def leave_one_out(K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return error, score
 
 
-def downdate(d: np.ndarray, z: np.ndarray, rho: float) -> tuple[np.ndarray, np.ndarray]:
+def downdate(d: Array, z: Array, rho: float) -> tuple[Array, Array]:
     """Return the eigenvalues of diag(d) - rho z z^T, and |rho z| along each eigenvector.
 
     Parameters
@@ -150,9 +150,7 @@ def downdate(d: np.ndarray, z: np.ndarray, rho: float) -> tuple[np.ndarray, np.n
     return eigenvalue[order], along[order]
 
 
-def specificity(
-    K: np.ndarray, n_samples: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def specificity(K: Array, n_samples: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
     """Return vertex distances of random shapes of the model to the nearest shape of the collection.
 
     Parameters
@@ -184,9 +182,7 @@ def specificity(
     return np.array(distance), np.array(nearest), score
 
 
-def variance_baseline(
-    features: np.ndarray, n_permutations: int, rng: np.random.Generator
-) -> np.ndarray:
+def variance_baseline(features: Array, n_permutations: int, rng: np.random.Generator) -> Array:
     """Return variance shares under the null hypothesis of independent features (Horn 1965).
 
     Every feature is permuted over the shapes.
@@ -212,7 +208,7 @@ def variance_baseline(
 
 
 def count_components(
-    variance: np.ndarray,
+    variance: Array,
     s: int,
     n_components: int | None,
     *,
@@ -239,14 +235,12 @@ def count_components(
     return int(n_components)
 
 
-def mean_distance(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarray:
+def mean_distance(P: Array, X: Array, T: Array) -> Array:
     """Return the mean distance of points ``(..., p, 3)`` to a surface ``(...)``."""
     return distance_to_surface(P.reshape(-1, 3), X, T).reshape(P.shape[:-1]).mean(-1)
 
 
-def surface_error(
-    points: np.ndarray, steps: np.ndarray, X: np.ndarray, T: np.ndarray
-) -> np.ndarray:
+def surface_error(points: Array, steps: Array, X: Array, T: Array) -> Array:
     """Return mean distances of reconstructions of a left-out shape to its surface X, T.
 
     Parameters
@@ -267,7 +261,7 @@ def surface_error(
     return np.pad(mean_distance(P, X, T), (0, len(points) - len(P)), mode="edge")
 
 
-def draw_points(area: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+def draw_points(area: Array, n: int, rng: np.random.Generator) -> Array:
     """Draw vertices ``(n,)`` with probability by area (of sum 1), sorted."""
     return np.sort(rng.choice(len(area), min(n, len(area)), replace=False, p=area))
 

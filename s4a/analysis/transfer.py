@@ -35,13 +35,13 @@ from s4a.method.register import common_unit, identity, uncertainty
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
-from s4a.schema import dataset, in_unit, require
+from s4a.schema import Array, dataset, in_unit, require
 from s4a.study.pair import log_warning, match_both, shape_of
 
 BLURS = {None: 1.0, "fast": 1.0, "paper": 0.0}  # default of `blur` by preset
 
 # Triangles (p,) and barycentric weights (p, 3) of points on a surface, and their confidence (p,).
-Points = tuple[np.ndarray, np.ndarray, np.ndarray]
+Points = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -53,29 +53,29 @@ class Link:
     shape's vertices on the template.
     """
 
-    X: np.ndarray
-    T: np.ndarray
-    Y: np.ndarray
-    S: np.ndarray
-    image: np.ndarray
-    confidence: np.ndarray
-    triangle: np.ndarray
-    weights: np.ndarray
+    X: Array
+    T: Array
+    Y: Array
+    S: Array
+    image: Array
+    confidence: Array
+    triangle: Array
+    weights: Array
 
     @cached_property
-    def down(self) -> tuple[sp.csr_matrix, np.ndarray]:
+    def down(self) -> tuple[sp.csr_matrix, Array]:
         """Matrix ``(p, n)`` of values from template to shape, and confidence on the shape."""
         W = interpolation_matrix(self.T, self.triangle, self.weights, len(self.X))
         return W, W @ self.confidence
 
     @cached_property
-    def up(self) -> tuple[sp.csr_matrix, np.ndarray]:
+    def up(self) -> tuple[sp.csr_matrix, Array]:
         """Matrix ``(n, p)`` of values from shape to template, and confidence on the template."""
         normals = vertex_normals(self.image, self.T)
         triangle, weights = closest_facing_point(self.image, normals, self.Y, self.S)
         return interpolation_matrix(self.S, triangle, weights, len(self.Y)), self.confidence
 
-    def transfer_down(self, triangle: np.ndarray, weights: np.ndarray) -> Points:
+    def transfer_down(self, triangle: Array, weights: Array) -> Points:
         """Transfer points on the template to the shape."""
         points = (self.T, triangle, weights)
         P = interpolate(self.image, *points)
@@ -83,7 +83,7 @@ class Link:
         confidence = interpolate(self.confidence[:, None], *points)[:, 0]
         return *closest_facing_point(P, N, self.Y, self.S), confidence
 
-    def transfer_up(self, triangle: np.ndarray, weights: np.ndarray) -> Points:
+    def transfer_up(self, triangle: Array, weights: Array) -> Points:
         """Transfer points on the shape to the template."""
         P = interpolate(self.Y, self.S, triangle, weights)
         N = interpolate(vertex_normals(self.Y, self.S), self.S, triangle, weights)
@@ -95,7 +95,7 @@ class Link:
 Route = list[tuple[Link, str]]  # links with their directions, "down" or "up"
 
 
-def image_in_shape(X: np.ndarray, registered: xr.Dataset) -> np.ndarray:
+def image_in_shape(X: Array, registered: xr.Dataset) -> Array:
     """Return the registered template ``(n, 3)`` in the coordinates of the shape's file.
 
     `registered` is the shape's part of ``/registration``, with the alignment s R x + t.
@@ -112,7 +112,7 @@ def link(template: xr.Dataset, shape: xr.Dataset, registered: xr.Dataset) -> Lin
     return Link(X, T, Y, S, image_in_shape(X, registered), *(registered[n].values for n in names))
 
 
-def matrix_along(route: Route, n: int) -> tuple[sp.csr_matrix, np.ndarray]:
+def matrix_along(route: Route, n: int) -> tuple[sp.csr_matrix, Array]:
     """Return the matrix of a route from n vertices, and the confidence on the last mesh."""
     if not route:
         return sp.identity(n, format="csr"), np.ones(n)
@@ -124,7 +124,7 @@ def matrix_along(route: Route, n: int) -> tuple[sp.csr_matrix, np.ndarray]:
     return W, confidence
 
 
-def transfer_along(route: Route, triangle: np.ndarray, weights: np.ndarray) -> Points:
+def transfer_along(route: Route, triangle: Array, weights: Array) -> Points:
     """Transfer points from the first mesh of a route to the last."""
     confidence = np.ones(len(triangle))
     for step, direction in route:
@@ -134,7 +134,7 @@ def transfer_along(route: Route, triangle: np.ndarray, weights: np.ndarray) -> P
     return triangle, weights, confidence
 
 
-def blend_routes(routes: list[Route], n: int) -> tuple[sp.csr_matrix, np.ndarray]:
+def blend_routes(routes: list[Route], n: int) -> tuple[sp.csr_matrix, Array]:
     """Average routes, weighted by confidence: matrix ``(p, n)`` and mean confidence ``(p,)``."""
     matrices, confidences = zip(*(matrix_along(route, n) for route in routes), strict=True)
     weight = np.stack(confidences) + 1e-9  # (routes, p), no zero in the sum below
@@ -143,7 +143,7 @@ def blend_routes(routes: list[Route], n: int) -> tuple[sp.csr_matrix, np.ndarray
     return W.tocsr(), np.mean(confidences, axis=0)
 
 
-def votes_of(W: sp.csr_matrix, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def votes_of(W: sp.csr_matrix, label: Array) -> tuple[Array, Array]:
     """Return the votes of the source vertices for every label at every target vertex.
 
     Parameters
@@ -162,7 +162,7 @@ def votes_of(W: sp.csr_matrix, label: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return (W @ one_hot).toarray().astype(np.float32), value
 
 
-def diffuse_votes(vote: np.ndarray, X: np.ndarray, T: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def diffuse_votes(vote: Array, X: Array, T: Array, radius: Array) -> Array:
     """Diffuse votes by an implicit heat step, (A + W) v = A v0, over the uncertainty of the match.
 
     A are the vertex areas, W is the stiffness matrix times t = area radius^2 / 4.  In the plane the
@@ -196,7 +196,7 @@ def diffuse_votes(vote: np.ndarray, X: np.ndarray, T: np.ndarray, radius: np.nda
     return diffused
 
 
-def majority(vote: np.ndarray, value: np.ndarray) -> np.ndarray:
+def majority(vote: Array, value: Array) -> Array:
     """Return the label with most votes at every vertex; ties give the first in sorted order.
 
     Examples
@@ -455,7 +455,7 @@ def transfer_labels(
 
 def transfer_scalars(
     study: xr.DataTree,
-    field: np.ndarray,
+    field: Array,
     *,
     source: str | xr.Dataset | None = None,
     targets: list[str] | None = None,
@@ -505,7 +505,7 @@ def transfer_scalars(
     return xr.DataTree.from_dict(transferred)
 
 
-def on_template(study: xr.DataTree, name: str, field: np.ndarray) -> np.ndarray:
+def on_template(study: xr.DataTree, name: str, field: Array) -> Array:
     """Transfer a scalar field of a shape ``(vertex,)`` to the template.
 
     As :func:`transfer_scalars`; a field of the template is unchanged.

@@ -16,6 +16,7 @@ from s4a.geometry.mesh import as_arrays
 from s4a.input.chirality import map_to_file
 from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved, turned
 from s4a.input.labels import read_grid, voxels_marked
+from s4a.schema import Array
 
 VOLUMES = ("NIfTI", "MGH", "NRRD")
 
@@ -24,7 +25,7 @@ def write_label_volumes(
     study: xr.DataTree,
     folder: Path | str,
     *,
-    label: np.ndarray | None = None,
+    label: Array | None = None,
     grid: Path | str | None = None,
     coordinate_system: str | None = None,
     unit: str | None = None,

@@ -23,7 +23,7 @@ from s4a.geometry.compiled import fpsample
 from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, vertex_areas
 from s4a.input.collection import read_shapes
 from s4a.input.files import write_mesh
-from s4a.schema import check_choice, check_count, dataset, in_unit
+from s4a.schema import Array, check_choice, check_count, dataset, in_unit
 from s4a.seeds import RNG, seed_of
 from s4a.study.pipeline import analyse
 
@@ -190,7 +190,7 @@ def _fold_noise(p):
     return total * 2 / np.sqrt(waves)
 
 
-def reference_brain(u: ArrayLike) -> np.ndarray:
+def reference_brain(u: ArrayLike) -> Array:
     """Map points u (p, 3) of the unit sphere to the reference brain: (p, 3) in mm."""
     u = np.asarray(u, float)
     x, y, z = u.T
@@ -385,7 +385,7 @@ def simulate(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = 
     return truth.assign_coords(shape=[f"brain_{i + 1:0{max(2, len(str(n)))}d}" for i in range(n)])
 
 
-def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: ArrayLike) -> np.ndarray:
+def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: ArrayLike) -> Array:
     """Return the exact positions of reference points on a shape.
 
     Parameters
@@ -476,7 +476,7 @@ def _mesh(truth, shape, n_vertices, rng):
     return u, _delaunay(u)
 
 
-def labels(reference_point: ArrayLike) -> np.ndarray:
+def labels(reference_point: ArrayLike) -> Array:
     """Return labels of reference points: indices in :data:`LABELS`, 0 for NaN.
 
     Examples

@@ -22,17 +22,17 @@ from s4a.geometry.mesh import (
     vertex_areas,
 )
 from s4a.method.deform import distortion as distortion
-from s4a.schema import check_choice, dataset, require
+from s4a.schema import Array, check_choice, dataset, require
 
 THRESHOLDS = np.linspace(0, 0.25, 101)  # of the error curve, as in Kim et al. (2011), Fig. 6
 
 
-def nearest_distances(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def nearest_distances(X: Array, Y: Array) -> tuple[Array, Array]:
     """Return distances to the nearest point: ``(n,)`` from X to Y, ``(p,)`` from Y to X."""
     return cKDTree(Y).query(X)[0], cKDTree(X).query(Y)[0]
 
 
-def chamfer(X: np.ndarray, Y: np.ndarray) -> float:
+def chamfer(X: Array, Y: Array) -> float:
     """Chamfer distance of two point sets (eq. 9).
 
     Sum of the mean distances to the nearest point in both directions.
@@ -62,7 +62,7 @@ def chamfer(X: np.ndarray, Y: np.ndarray) -> float:
     return float(sum(distance.mean() for distance in nearest_distances(X, Y)))
 
 
-def hausdorff(X: np.ndarray, Y: np.ndarray, formula: str = "standard") -> float:
+def hausdorff(X: Array, Y: Array, formula: str = "standard") -> float:
     """Hausdorff distance of two point sets (eq. 10): largest distance to the nearest point.
 
     It sees only the worst point, and like :func:`chamfer` it cannot see permutations.
@@ -96,7 +96,7 @@ def hausdorff(X: np.ndarray, Y: np.ndarray, formula: str = "standard") -> float:
     return float(max(forth, back) if formula == "standard" else forth + back / len(Y))
 
 
-def dirichlet(f: np.ndarray, E: np.ndarray, w: np.ndarray) -> float:
+def dirichlet(f: Array, E: Array, w: Array) -> float:
     """Dirichlet energy f^T A L f of functions on the vertices (eq. 11), summed over functions.
 
     With L = A^-1 W it is f^T W f, the sum of w (f_i - f_j)^2 over the edges: the areas cancel, and
@@ -133,9 +133,7 @@ def dirichlet(f: np.ndarray, E: np.ndarray, w: np.ndarray) -> float:
     return float(w @ (difference**2).sum(axis=1))
 
 
-def geodesic_error(
-    X: np.ndarray, T: np.ndarray, match: np.ndarray, true: np.ndarray, *, limit: float = 1.0
-) -> np.ndarray:
+def geodesic_error(X: Array, T: Array, match: Array, true: Array, *, limit: float = 1.0) -> Array:
     """Return distances from true to matched vertices along edges, as shares of sqrt(area).
 
     Princeton protocol with paths along edges, which are up to 10 % longer than geodesics.  It sees
@@ -174,7 +172,7 @@ def geodesic_error(
     )
 
 
-def error_curve(error: np.ndarray, thresholds: ArrayLike = THRESHOLDS) -> np.ndarray:
+def error_curve(error: Array, thresholds: ArrayLike = THRESHOLDS) -> Array:
     """Return the share of errors up to each threshold ``(t,)``.
 
     The cumulative curve of the Princeton protocol distinguishes few gross errors from many small
@@ -190,7 +188,7 @@ def error_curve(error: np.ndarray, thresholds: ArrayLike = THRESHOLDS) -> np.nda
     return np.searchsorted(np.sort(error), thresholds, side="right") / len(error)
 
 
-def coverage(match: np.ndarray, area: np.ndarray) -> float:
+def coverage(match: Array, area: Array) -> float:
     """Return the share of the source's area whose vertices are matched by the target.
 
     It sees a map that collapses.  It cannot see a wrong map: a random permutation scores 1.  If the
@@ -212,12 +210,12 @@ def coverage(match: np.ndarray, area: np.ndarray) -> float:
 
 
 def cycle_error(
-    X: np.ndarray,
-    T: np.ndarray,
-    *matches: np.ndarray,
-    vertices: np.ndarray | None = None,
+    X: Array,
+    T: Array,
+    *matches: Array,
+    vertices: Array | None = None,
     limit: float = 1.0,
-) -> np.ndarray:
+) -> Array:
     """Return the distance of vertices from their images under a cycle of matches.
 
     It sees inconsistent matches without ground truth.  It cannot see errors that cancel: a
@@ -254,7 +252,7 @@ def cycle_error(
     return geodesic_error(X, T, end, start, limit=limit)
 
 
-def label_accuracy(label: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> float:
+def label_accuracy(label: ArrayLike, true: ArrayLike, area: Array | None = None) -> float:
     """Return the share of the vertices, or of the area, with the correct label.
 
     It sees gross errors only, as most vertices are far from any border; :func:`dice` also sees
@@ -278,7 +276,7 @@ def label_accuracy(label: ArrayLike, true: ArrayLike, area: np.ndarray | None = 
     return float(np.average(np.asarray(label) == np.asarray(true), weights=area))
 
 
-def dice(label: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> dict[Any, float]:
+def dice(label: ArrayLike, true: ArrayLike, area: Array | None = None) -> dict[Any, float]:
     """Return the Dice coefficient 2 |A n B| / (|A| + |B|) of each label, by vertices or area.
 
     It sees each region, small ones like large ones.  It cannot see errors inside a region.
@@ -313,7 +311,7 @@ def dice(label: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> d
     return overlap
 
 
-def landmark_error(position: ArrayLike, true: ArrayLike) -> np.ndarray:
+def landmark_error(position: ArrayLike, true: ArrayLike) -> Array:
     """Return Euclidean distances of landmarks from the true ones ``(p,)``, in their unit.
 
     It sees the map at a few points that an expert has marked, including the expert's error, and
@@ -328,7 +326,7 @@ def _median(values, weight):
     return np.quantile(values, 0.5, **weighted) if len(values) else np.inf
 
 
-def true_positions(truth: ArrayLike, X: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+def true_positions(truth: ArrayLike, X: Array, n: int) -> tuple[Array, Array]:
     """Convert ground truth of :func:`evaluate` to positions and to vertices of the source.
 
     Parameters
@@ -397,10 +395,10 @@ def _evenly_spaced(n, most):
 def evaluate(
     source: xr.Dataset,
     target: xr.Dataset,
-    match: np.ndarray,
+    match: Array,
     *,
-    image: np.ndarray | None = None,
-    reverse: np.ndarray | None = None,
+    image: Array | None = None,
+    reverse: Array | None = None,
     truth: ArrayLike | None = None,
     n_geodesic: int = 1000,
     thresholds: ArrayLike = THRESHOLDS,

@@ -21,7 +21,7 @@ from s4a.input.files import stem_of
 from s4a.input.formats import gifti_arrays, ply_properties
 from s4a.input.raw import check_there, content, npy, npz, reading, shown, text_of, xml
 from s4a.options import MILLIMETRES, check_unit
-from s4a.schema import dataset, require, unit_of
+from s4a.schema import Array, dataset, require, unit_of
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ _MARKUPS = (
 _FORMULA = r"[=+@\t\r-]."  # the beginning of a cell that a spreadsheet evaluates
 
 
-def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
+def read_labels(path: Path | str, n: int | None = None) -> Array:
     """Read one label per vertex from a file.
 
     Parameters
@@ -565,7 +565,7 @@ def _markups(landmarks):
     return {"@schema": _MARKUPS, "markups": lists}
 
 
-def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> np.ndarray:
+def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> Array:
     """Map labels from the vertices of a file to those of the cleaned mesh.
 
     Raises
@@ -592,9 +592,7 @@ def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> np.ndarray:
     return np.asarray(labels)[mesh["file_vertex"].values]
 
 
-def labels_of_file(
-    labels: np.ndarray, mesh: xr.Dataset, points: np.ndarray
-) -> tuple[np.ndarray, int]:
+def labels_of_file(labels: Array, mesh: xr.Dataset, points: Array) -> tuple[Array, int]:
     """Map labels from the vertices of a cleaned mesh to those of its file.
 
     Parameters
@@ -631,7 +629,7 @@ _CURV = b"\xff\xff\xff"  # first bytes of FreeSurfer's curvature files
 SUFFIXES = (".npy", ".npz", ".ply", ".csv", ".txt", ".gii")
 
 
-def read_scalars(path: Path | str, name: str = "", n: int | None = None) -> np.ndarray:
+def read_scalars(path: Path | str, name: str = "", n: int | None = None) -> Array:
     """Read one number per vertex from a file.
 
     Parameters
@@ -677,7 +675,7 @@ def read_scalars(path: Path | str, name: str = "", n: int | None = None) -> np.n
     return values.astype(float)
 
 
-def of_vertices(values: Any, mesh: xr.Dataset, what: str) -> np.ndarray:
+def of_vertices(values: Any, mesh: xr.Dataset, what: str) -> Array:
     """Return a field ``(n,)`` on the vertices of a clean mesh, given for these or for its file.
 
     Raises ValueError, with `what` as the name of the field, if the values are not numbers, have

@@ -25,7 +25,7 @@ from s4a.method.median import median_shape
 from s4a.method.register import from_latent, identity, match_functions, match_low
 from s4a.method.shape import Basis, Shape
 from s4a.options import N_SAMPLES, check, kept_options, names_of
-from s4a.schema import check_count, check_type, dataset, require
+from s4a.schema import Array, check_count, check_type, dataset, require
 
 PROJECTION = names_of("projection")
 REGISTRATION = [*names_of("registration"), "alignment", "dense_match", *PROJECTION]
@@ -279,7 +279,7 @@ def with_transforms(
     transforms: dict[str, RigidTransform],
     reference: str,
     residuals: Sequence[float],
-    distance: np.ndarray,
+    distance: Array,
 ) -> xr.Dataset:
     """Add to a network the transforms onto the `reference`, their residuals, spectral distances."""
     R, t = (np.stack(values) for values in zip(*transforms.values(), strict=True))
@@ -391,7 +391,7 @@ def refine_network(
             f"k must be at least {C_initial.shape[1]}, the size of the initial maps; found {k}"
         )
     iterations: dict[str, xr.Dataset] = {}
-    history: list[tuple[int, np.ndarray, np.ndarray]] = []
+    history: list[tuple[int, Array, Array]] = []
 
     def keep(C, Y, latent_eigenvalue, weight, error):
         history.append((len(Y[0]), weight, error))
@@ -545,7 +545,7 @@ def out_of_sample_basis_in(
     basis: Basis,
     transforms: Callable[[str], RigidTransform],
     **options: Any,
-) -> np.ndarray:
+) -> Array:
     """Compute the latent basis Y ``(k, m)`` of an out-of-sample shape (eq. 3).
 
     Parameters

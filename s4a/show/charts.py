@@ -16,6 +16,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from s4a.geometry.mesh import as_arrays
+from s4a.schema import Array
 from s4a.show.draw import (
     CYCLE_ERROR,
     SIGNED,
@@ -63,13 +64,13 @@ def _figure(width, height, columns=1, rows=1, kind=Figure):
         return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def on_circle(n: int) -> np.ndarray:
+def on_circle(n: int) -> Array:
     """Return `n` equidistant points ``(n, 2)`` on the unit circle."""
     angle = 2 * np.pi * np.arange(n) / max(n, 1)
     return np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
 
-def reach(values: np.ndarray, share: float) -> float:
+def reach(values: Array, share: float) -> float:
     """Return the `share` quantile of the absolute values without NaN; 0 if all are NaN.
 
     Examples
@@ -85,7 +86,7 @@ def reach(values: np.ndarray, share: float) -> float:
 
 def surfaces(
     meshes: dict[str, xr.Dataset],
-    values: dict[str, np.ndarray] | None = None,
+    values: dict[str, Array] | None = None,
     *,
     limit: float | None = None,
     label: str = "",
@@ -250,11 +251,11 @@ def _names(ax, positions, names):
 
 
 def network(
-    positions: np.ndarray,
+    positions: Array,
     names: list[str],
-    source: np.ndarray,
-    target: np.ndarray,
-    errors: dict[str, np.ndarray],
+    source: Array,
+    target: Array,
+    errors: dict[str, Array],
     highlight: int | None = None,
 ) -> Figure:
     """Draw the network of maps once for each array of edge errors, on one logarithmic scale.
@@ -309,7 +310,7 @@ def network(
     return figure
 
 
-def matrices(named: dict[str, np.ndarray]) -> Figure:
+def matrices(named: dict[str, Array]) -> Figure:
     """Draw functional maps side by side with signed colours from -1 to 1, blue positive.
 
     Parameters
@@ -340,9 +341,7 @@ def matrices(named: dict[str, np.ndarray]) -> Figure:
     return figure
 
 
-def ranked(
-    names: list[str], values: np.ndarray, label: str, highlight: int | None = None
-) -> Figure:
+def ranked(names: list[str], values: Array, label: str, highlight: int | None = None) -> Figure:
     """Draw bars in ascending order; `highlight` is the index of a shape to mark.
 
     Examples
@@ -364,7 +363,7 @@ def ranked(
     return figure
 
 
-def stacked(names: list[str], parts: list[str], seconds: np.ndarray) -> Figure:
+def stacked(names: list[str], parts: list[str], seconds: Array) -> Figure:
     """Draw a stacked bar of seconds for each name, with the total at its end (Fig. 3).
 
     Parameters
@@ -394,7 +393,7 @@ def stacked(names: list[str], parts: list[str], seconds: np.ndarray) -> Figure:
     return figure
 
 
-def variance(high: np.ndarray | list[Any], low: np.ndarray | list[Any] | None = None) -> Figure:
+def variance(high: Array | list[Any], low: Array | list[Any] | None = None) -> Figure:
     """Draw the cumulative explained variance at both resolutions (Fig. 5).
 
     Examples
@@ -422,7 +421,7 @@ def variance(high: np.ndarray | list[Any], low: np.ndarray | list[Any] | None = 
 
 
 def scores(
-    score: np.ndarray,
+    score: Array,
     names: list[str],
     highlight: int | None = None,
     faint: Sequence[bool] | None = None,

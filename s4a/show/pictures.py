@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
-from s4a.schema import check_count
+from s4a.schema import Array, check_count
 from s4a.show.browser import appearance_state, color_scale
 from s4a.show.charts import reach
 from s4a.show.draw import SIGNED, Viewpoint, plane_box, render, rotation, signed_colors
@@ -27,7 +27,7 @@ BAND = 1_000_000  # pixels that are rendered at once, about 500 MB
 FILMS = {".gif": "GIF", ".webp": "WEBP", ".apng": "PNG"}
 
 
-def shared_frames(surfaces: list[np.ndarray], camera: dict[str, Any]) -> list[np.ndarray]:
+def shared_frames(surfaces: list[Array], camera: dict[str, Any]) -> list[Array]:
     """Return a frame ``(2, 2)`` around each surface, all of one size, so that sizes compare."""
     boxes = np.array([plane_box(X, **camera) for X in surfaces])
     half = (boxes[:, 1] - boxes[:, 0]).max(0) / 2
@@ -42,7 +42,7 @@ def mode_pictures(
     size: tuple[int, int] = PANEL,
     view: Viewpoint = "corner",
     up: str = "z",
-) -> list[list[np.ndarray]]:
+) -> list[list[Array]]:
     """Return pictures ``(height, width, 4)``, a row for each mode and a column for each score.
 
     They have one frame, with room for three standard deviations, and one colour scale
@@ -59,9 +59,9 @@ class Cell(NamedTuple):
     """A surface in a picture, with axes right, up and towards the viewer."""
 
     title: str
-    points: np.ndarray  # (n, 3)
-    triangles: np.ndarray
-    colors: np.ndarray | None
+    points: Array  # (n, 3)
+    triangles: Array
+    colors: Array | None
     bar: dict[str, Any]  # result of color_scale, or empty
 
 
@@ -71,7 +71,7 @@ def write_picture(
     *,
     mode: int | Sequence[int] | None = None,
     score: float | Sequence[float] = (-SIGMA, 0, SIGMA),
-    values: np.ndarray | None = None,
+    values: Array | None = None,
     label: str = "",
     title: str = "",
     view: Viewpoint = "corner",
@@ -148,7 +148,7 @@ def write_film(
     reach: float = SIGMA,
     turn: bool = False,
     score: float = 0.0,
-    values: np.ndarray | None = None,
+    values: Array | None = None,
     label: str = "",
     title: str = "",
     view: Viewpoint = "corner",

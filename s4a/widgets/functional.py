@@ -6,6 +6,7 @@ import traitlets
 
 from s4a.method.fmap import off_diagonal_mass, orthogonality_error, swapped_blocks, zoomout
 from s4a.method.shape import Shape
+from s4a.schema import Array
 from s4a.show.browser import PARTS
 from s4a.show.surfaces import low_text, surface
 from s4a.widgets.panel import WIDE, Panel, checkbox, columns, dropdown, int_slider, row
@@ -116,7 +117,7 @@ class FunctionalMap(Panel):
             scene.caption = low_text(mesh)
         self.show_cell(self.cell)
 
-    def map_of(self, k: int) -> np.ndarray:
+    def map_of(self, k: int) -> Array:
         """Return C ``(k, k)``: a block of the study's map, or ZoomOut from the initial map."""
         network = self.study["network"].dataset.isel(pair=self.pair)
         if self.kind.value == "study":

@@ -7,6 +7,7 @@ import numpy as np
 import traitlets
 
 from s4a.method.spectral import reconstruct, weyl
+from s4a.schema import Array
 from s4a.show.charts import BLUE, GREY, ORANGE
 from s4a.show.surfaces import labelled, low_text, surface, unit_text
 from s4a.widgets.panel import Panel, columns, dropdown, int_slider, row
@@ -106,7 +107,7 @@ class Spectrum(Panel):
                 marker=self.index.value,
             )
 
-    def curve(self, name: str, law: np.ndarray) -> dict:
+    def curve(self, name: str, law: Array) -> dict:
         """Return the curve of a shape's eigenvalues minus `law`."""
         values, chosen = self.eigenvalues[name], name == self.shape
         last = f"number {len(values) - 1} is {values[-1]:.1f}"

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, normal_sums, vertex_normals
-from s4a.schema import check_choice, require
+from s4a.schema import Array, check_choice, require
 from s4a.show import draw
 from s4a.show.browser import color_scale
 from s4a.show.draw import CLAY, SIGNED, Viewpoint
@@ -65,7 +65,7 @@ LIGHTS = (  # uniforms that three.js fills in for a lit shader
 
 def surface(
     mesh: xr.Dataset,
-    field: str | np.ndarray | xr.DataArray | None = None,
+    field: str | Array | xr.DataArray | None = None,
     cmap: str | Colormap | None = None,
     *,
     limits: tuple[float, float] | None = None,
@@ -141,10 +141,10 @@ def _field_colors(mesh, field, cmap, limits):
 
 
 def field_colors(
-    values: np.ndarray,
+    values: Array,
     cmap: str | Colormap | None = None,
     limits: tuple[float, float] | None = None,
-) -> np.ndarray:
+) -> Array:
     """Return colours ``(n, 3)`` of numbers ``(n,)``; see :func:`surface`.
 
     Examples
@@ -307,9 +307,7 @@ def modes(
     return ModesMesh(geometry, material, scores=[0.0] * len(deformation), frustumCulled=False)
 
 
-def mode_table(
-    mean: np.ndarray, T: np.ndarray, deformation: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def mode_table(mean: Array, T: Array, deformation: Array) -> tuple[Array, Array]:
     """Return a texture (rows, 2048, 4) of displacements and normal changes, and `bends` (c,).
 
     The change of a normal is the derivative of the sum of triangle normals by the score, relative
@@ -340,7 +338,7 @@ def mode_table(
 
 
 def points(
-    positions: xr.Dataset | Mapping[str, np.ndarray] | np.ndarray,
+    positions: xr.Dataset | Mapping[str, Array] | Array,
     color: str = LANDMARK,
     *,
     radius: float | None = None,
@@ -404,7 +402,7 @@ def _name(text, position, height, *, hidden=True):
 
 
 def correspondence(
-    pair: xr.Dataset | xr.DataTree | np.ndarray,
+    pair: xr.Dataset | xr.DataTree | Array,
     source: xr.Dataset | str,
     target: xr.Dataset | str,
     *,
