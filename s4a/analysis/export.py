@@ -1,6 +1,5 @@
 """Export of registered collections to other programs (4.3, 6.1, 6.2): meshes and tables."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,12 +27,6 @@ from s4a.study import store
 FORMATS = {"ply": ".ply", "vtk": ".vtk", "obj": ".obj", "npz": ".npz", "gifti": ".gii"}
 
 
-def write_table(path: Path, head: Iterable[Any], rows: Iterable[Any]) -> Path:
-    """Write a CSV file and return its path."""
-    write_rows(path, [head, *rows])
-    return path
-
-
 def write_dataset(data: xr.Dataset | xr.DataTree, path: Path) -> Path:
     """Write a Dataset or tree to a netCDF file with checksums, atomically; return its path."""
     store.write(data, path)
@@ -44,7 +37,7 @@ def write_scores(pca: xr.Dataset, path: Path) -> Path:
     """Write scores to a CSV file, a row per shape, in standard deviations; return its path."""
     columns = (f"component_{c + 1}" for c in range(pca.sizes["component"]))
     rows = zip(pca["shape"].values.tolist(), pca["score"].values.tolist(), strict=True)
-    return write_table(path, ["shape", *columns], ([name, *row] for name, row in rows))
+    return write_rows(path, [["shape", *columns], *([name, *row] for name, row in rows)])
 
 
 def write_registered(
@@ -180,17 +173,14 @@ def _write_modes(pca, folder, n_modes):
     components = range(1, pca.sizes["component"] + 1)
     measures = ["standard_deviation", "explained_variance_ratio"]
     columns = (pca[name].values.tolist() for name in measures)
+    rows = zip(components, *columns, strict=True)
     paths = [
         write_scores(pca, folder / "scores.csv"),
-        write_table(
-            folder / "components.csv",
-            ["component", *measures],
-            zip(components, *columns, strict=True),
-        ),
+        write_rows(folder / "components.csv", [["component", *measures], *rows]),
     ]
     for c in components[:n_modes]:
         mode = pca["deformation"].values[c - 1].tolist()
-        paths.append(write_table(folder / f"mode_{c}.csv", "xyz", mode))
+        paths.append(write_rows(folder / f"mode_{c}.csv", ["xyz", *mode]))
     return [*paths, write_dataset(pca.load(), folder / "modes.nc")]
 
 
@@ -231,9 +221,8 @@ def write_results(result: xr.Dataset, folder: Path | str, name: str) -> list[Pat
         rows = zip(*columns.values(), strict=True)
         if dims:
             rows = zip(_index_of(result, dims[0]), *columns.values(), strict=True)
-        paths.append(
-            write_table(folder / f"{'.'.join([name, *dims])}.csv", [*dims, *columns], rows)
-        )
+        file = folder / f"{'.'.join([name, *dims])}.csv"
+        paths.append(write_rows(file, [[*dims, *columns], *rows]))
     return paths
 
 

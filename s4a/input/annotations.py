@@ -213,10 +213,11 @@ def table_rows(text: str) -> dict[int, list[str]]:
     return rows
 
 
-def write_rows(path: Path | str, rows: Iterable[Iterable[Any]]) -> None:
-    """Write a CSV file; a text that a spreadsheet would take for a formula gets an apostrophe.
+def write_rows(path: Path, rows: Iterable[Iterable[Any]]) -> Path:
+    """Write a CSV file and return its path.
 
-    :func:`table_rows` removes the apostrophe.
+    A text that a spreadsheet would take for a formula gets an apostrophe, which
+    :func:`table_rows` removes.
 
     Examples
     --------
@@ -224,12 +225,12 @@ def write_rows(path: Path | str, rows: Iterable[Iterable[Any]]) -> None:
     >>> from pathlib import Path
     >>> from s4a.input.annotations import write_rows
     >>> path = Path(tempfile.mkdtemp()) / "table.csv"
-    >>> write_rows(path, [["a", "=1+1", "-3.2", -3.2]])
-    >>> path.read_text().strip()
+    >>> write_rows(path, [["a", "=1+1", "-3.2", -3.2]]).read_text().strip()
     "a,'=1+1,-3.2,-3.2"
     """
     with open(path, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([[_escaped(cell) for cell in row] for row in rows])
+    return path
 
 
 def _escaped(cell):
@@ -529,7 +530,7 @@ def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
     if "landmark_curve" in landmarks:
         head += ["curve", "closed"]
         columns += [landmarks["landmark_curve"].values, landmarks["landmark_closed"].values]
-    write_rows(path, [head, *zip(*(column.tolist() for column in columns), strict=True)])
+    write_rows(Path(path), [head, *zip(*(column.tolist() for column in columns), strict=True)])
 
 
 def _markups(landmarks):
