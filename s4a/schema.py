@@ -603,6 +603,25 @@ def check_indices(name: str, values: np.ndarray, sizes: Mapping[str, int]) -> No
         raise ValueError(f"{name} needs indices {least}..{end} of {dim}, found {low}..{high}")
 
 
+def check_rows(
+    name: str, values: ArrayLike, *shapes: tuple[int, ...], of: str = "vertices"
+) -> Array:
+    """Return values as an array; raise ValueError unless it has one of the shapes.
+
+    Examples
+    --------
+    >>> from s4a.schema import check_rows
+    >>> check_rows("label", [1, 2], (3,))
+    Traceback (most recent call last):
+    ValueError: label needs a value for each of the 3 vertices, shape (3,); found shape (2,)
+    """
+    values = np.asarray(values)
+    if values.shape not in shapes:
+        needed = f"the {shapes[0][0]} {of}, shape {' or '.join(map(str, dict.fromkeys(shapes)))}"
+        raise ValueError(f"{name} needs a value for each of {needed}; found shape {values.shape}")
+    return values
+
+
 def check_switch(name: str, value: object) -> None:
     """Raise ValueError unless an option is True or False."""
     if not isinstance(value, bool | np.bool_):

@@ -35,7 +35,7 @@ from s4a.method.register import common_unit, identity, uncertainty
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
-from s4a.schema import Array, dataset, in_unit, require
+from s4a.schema import Array, check_rows, dataset, in_unit, require
 from s4a.study.pair import log_warning, match_both, shape_of
 
 BLURS = {None: 1.0, "fast": 1.0, "paper": 0.0}  # default of `blur` by preset
@@ -429,7 +429,9 @@ def transfer_labels(
         raise ValueError(f"blur needs a factor from 0 to 10; found {blur}")
     sources, routes_to_targets = plan(study, label, source, targets, options)
     blur = BLURS[_preset(study, options)] if blur is None else blur
-    labels = [_per_vertex(values, mesh, "label") for mesh, values in sources]
+    labels = [
+        check_rows("labels of the source", one, (mesh.sizes["vertex"],)) for mesh, one in sources
+    ]
     transferred = {}
     for name, target, routes in routes_to_targets:
         blended = [blend_routes(r, len(one)) for r, one in zip(routes, labels, strict=True)]
@@ -497,7 +499,7 @@ def transfer_scalars(
     True
     """
     [(mesh, _)], routes_to_targets = plan(study, None, source, targets, options)
-    field = _per_vertex(field, mesh, "field").astype(float)
+    field = check_rows("field of the source", field, (mesh.sizes["vertex"],)).astype(float)
     transferred = {}
     for name, _, [routes] in routes_to_targets:
         value, confidence = _blend_field(routes, field)
@@ -521,16 +523,6 @@ def _blend_field(routes, field):
     value = W @ np.nan_to_num(field) / np.maximum(weight, 1e-12)
     value[weight < 0.5] = np.nan
     return value, confidence
-
-
-def _per_vertex(values, mesh, what):
-    values = np.asarray(values)
-    if values.shape != (mesh.sizes["vertex"],):
-        raise ValueError(
-            f"{what} needs one value for each of the {mesh.sizes['vertex']} vertices of the "
-            f"source; found shape {values.shape}"
-        )
-    return values
 
 
 def transfer_landmarks(

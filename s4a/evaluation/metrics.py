@@ -22,7 +22,7 @@ from s4a.geometry.mesh import (
     vertex_areas,
 )
 from s4a.method.deform import distortion as distortion
-from s4a.schema import Array, check_choice, dataset, require
+from s4a.schema import Array, check_choice, check_rows, dataset, require
 
 THRESHOLDS = np.linspace(0, 0.25, 101)  # of the error curve, as in Kim et al. (2011), Fig. 6
 
@@ -474,11 +474,7 @@ def evaluate(
     match = _check_match(match, target, source, "match")
     area, area_target = vertex_areas(X, T), vertex_areas(Y, S)
     size, size_target = np.sqrt(area.sum()), np.sqrt(area_target.sum())
-    image = X[match] if image is None else np.asarray(image, float)
-    if image.shape != Y.shape:
-        raise ValueError(
-            f"image needs a position for each vertex of the target, {Y.shape}; found {image.shape}"
-        )
+    image = X[match] if image is None else check_rows("image", image, Y.shape).astype(float)
     forth, back = nearest_distances(X / size, image / size)
     conformal, growth = distortion(Y / size_target, image / size, S)
     weight = triangle_areas(Y, S)

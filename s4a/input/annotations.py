@@ -21,7 +21,7 @@ from s4a.input.files import stem_of
 from s4a.input.formats import gifti_arrays, ply_properties
 from s4a.input.raw import check_there, content, npy, npz, reading, shown, text_of, xml
 from s4a.options import MILLIMETRES, check_unit
-from s4a.schema import Array, dataset, require, unit_of
+from s4a.schema import Array, check_rows, dataset, require, unit_of
 
 log = logging.getLogger(__name__)
 
@@ -584,13 +584,9 @@ def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> Array:
     [7, 5]
     """
     require(mesh, "file_vertex", "vertex_of_file", what="mesh")
-    n = mesh.sizes["file_vertex_index"]
-    if np.shape(labels) != (n,):
-        raise ValueError(
-            f"{n} labels, one per vertex of the file of the mesh, needed, "
-            f"found shape {np.shape(labels)}"
-        )
-    return np.asarray(labels)[mesh["file_vertex"].values]
+    shape = (mesh.sizes["file_vertex_index"],)
+    labels = check_rows("label", labels, shape, of="vertices of the file of the mesh")
+    return labels[mesh["file_vertex"].values]
 
 
 def labels_of_file(labels: Array, mesh: xr.Dataset, points: Array) -> tuple[Array, int]:
@@ -687,12 +683,7 @@ def of_vertices(values: Any, mesh: xr.Dataset, what: str) -> Array:
         raise ValueError(f"{what} needs numbers, found {values.dtype}")
     n = mesh.sizes["vertex"]
     n_file = mesh.sizes.get("file_vertex_index", n)
-    if values.shape not in ((n,), (n_file,)):
-        of_file = "" if n == n_file else f", or each of the {n_file} of its file"
-        raise ValueError(
-            f"{what} needs a number for each of the {n} vertices of its mesh{of_file}; found shape "
-            f"{values.shape}"
-        )
+    check_rows(what, values, (n,), (n_file,), of="vertices of its mesh, or of its file")
     if len(values) == n_file and "file_vertex" in mesh:
         values = values[mesh["file_vertex"].values]
     values = values.astype(float)

@@ -20,7 +20,7 @@ from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
 from s4a.input.labels import VOLUMES, grid_of, volume_format
 from s4a.input.polygons import triangulated
 from s4a.input.raw import check_there, content, regular_file, shown
-from s4a.schema import Array
+from s4a.schema import Array, check_rows
 
 SUFFIXES = {suffix: name for name, kind in FORMATS.items() for suffix in kind.suffixes.split()}
 SUFFIXES[".obj"] = "OBJ"  # and of MNI
@@ -217,12 +217,8 @@ def write_mesh(
     """
     path = Path(path)
     points, triangles, _ = _checked(points, triangles)
-    scalars = {name: np.asarray(values) for name, values in vertex_scalars.items()}
-    for name, values in scalars.items():
-        if values.shape != (len(points),):
-            raise ValueError(
-                f"{name} needs one value for each of {len(points)} vertices, found {values.shape}"
-            )
+    shape = (len(points),)
+    scalars = {name: check_rows(name, one, shape) for name, one in vertex_scalars.items()}
     suffix = path.suffix.lower()
     if suffix not in WRITERS:
         raise ValueError(f"a name ending in {', '.join(WRITERS)} needed, found {path.name}")

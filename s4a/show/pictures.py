@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
-from s4a.schema import Array, check_count
+from s4a.schema import Array, check_count, check_rows
 from s4a.show.browser import appearance_state, color_scale
 from s4a.show.charts import reach
 from s4a.show.draw import SIGNED, Viewpoint, plane_box, render, rotation, signed_colors
@@ -290,11 +290,8 @@ def _source(data, mode, values, label, view, up):
     cells = []
     if isinstance(data, xr.Dataset) and "corner_vertex" in data:
         X, T = as_arrays(data)
-        if values is not None and np.shape(values) not in ((len(X),), (len(X), 3)):
-            raise ValueError(
-                f"values need a number or a colour (r, g, b) for each of the {len(X)} vertices, "
-                f"found an array of shape {np.shape(values)}"
-            )
+        if values is not None:
+            check_rows("values", values, (len(X),), (len(X), 3))
         cells.append(Cell("", X @ R.T, T, *_value_colors(values, label)))
     elif hasattr(data, "comm"):  # a widget
         cells, axis = list(_views(data)), np.array([0.0, 1, 0])

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, normal_sums, vertex_normals
-from s4a.schema import Array, check_choice, require
+from s4a.schema import Array, check_choice, check_rows, require
 from s4a.show import draw
 from s4a.show.browser import color_scale
 from s4a.show.draw import CLAY, SIGNED, Viewpoint
@@ -128,11 +128,8 @@ def _field_colors(mesh, field, cmap, limits):
                 f"a variable of the mesh needed, found {field!r}; it has {', '.join(mesh)}"
             )
         field = mesh[field]
-    values, n = np.asarray(field), mesh.sizes["vertex"]
-    if values.shape not in ((n,), (n, 3)):
-        raise ValueError(
-            f"a value or a colour (3) for each of {n} vertices needed, found {values.shape}"
-        )
+    n = mesh.sizes["vertex"]
+    values = check_rows("field", field, (n,), (n, 3))
     if values.ndim == 2:
         return np.where(np.isfinite(values), np.clip(values, 0, 1), draw.UNKNOWN)
     if values.dtype.kind in "iub":
