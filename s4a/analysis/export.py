@@ -21,6 +21,7 @@ from s4a.input.coordinates import (
     turned,
 )
 from s4a.input.files import write_mesh
+from s4a.input.raw import new_folder
 from s4a.schema import Array, check_choice
 from s4a.study import store
 
@@ -109,8 +110,7 @@ def write_registered(
             "frame='shape' needs the transform of every shape; this study has none: use "
             "frame='template'"
         )
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = new_folder(folder)
     suffix = FORMATS[format]
     X, T = as_arrays(registration)
     paths, aligned = [], system_of_template(study, registration.attrs.get("template", ""))
@@ -210,8 +210,7 @@ def write_results(result: xr.Dataset, folder: Path | str, name: str) -> list[Pat
     >>> [path.name for path in paths], paths[2].read_text().split()
     (['test.nc', 'test.csv', 'test.shape.csv'], ['shape,outlier', '0,True', '1,False'])
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = new_folder(folder)
     paths = [write_dataset(result, folder / f"{name}.nc")]
     tables = {}  # dims -> columns
     for variable, values in result.data_vars.items():

@@ -35,7 +35,7 @@ from s4a.method.register import common_unit, identity, uncertainty
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
-from s4a.schema import Array, check_rows, dataset, in_unit, require
+from s4a.schema import Array, check_choice, check_rows, dataset, in_unit, require
 from s4a.study.pair import log_warning, match_both, shape_of
 
 BLURS = {None: 1.0, "fast": 1.0, "paper": 0.0}  # default of `blur` by preset
@@ -303,12 +303,10 @@ def plan(
     pairs = [(template if one is None else one, values) for one, values in pairs]
     inside = [one for one, _ in pairs if not isinstance(one, xr.Dataset)]
     targets = [n for n in names if n not in inside] if targets is None else list(targets)
-    unknown = [n for n in (*targets, *inside) if n not in names]
-    unknown = [n for n in unknown if n in targets or n != template]
-    if unknown:
-        raise ValueError(
-            f"no shape {', '.join(map(repr, unknown))} in the study; it has {', '.join(names)}"
-        )
+    for name in targets:
+        check_choice("target", name, names)
+    for one in inside:
+        check_choice("source", one, [*names, template])
     starts = [_start(study, one, options or {}) for one, _ in pairs]
 
     def routes_to_targets():

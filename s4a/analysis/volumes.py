@@ -16,6 +16,7 @@ from s4a.geometry.mesh import as_arrays
 from s4a.input.chirality import map_to_file
 from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved, turned
 from s4a.input.labels import read_grid, voxels_marked
+from s4a.input.raw import new_folder
 from s4a.schema import Array
 
 VOLUMES = ("NIfTI", "MGH", "NRRD")
@@ -105,8 +106,7 @@ def write_label_volumes(
         what = f"{name}, to be written in {volume},"
         maps[name] = map_between(file, system, what) @ map_to_file(attrs)
     transferred = transfer_labels(study, label, targets=names)
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = new_folder(folder)
     paths = []
     for name in names:
         mesh = study["original"][name].to_dataset()

@@ -23,6 +23,7 @@ from s4a.geometry.compiled import fpsample
 from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, vertex_areas
 from s4a.input.collection import read_shapes
 from s4a.input.files import write_mesh
+from s4a.input.raw import new_folder
 from s4a.schema import Array, check_choice, check_count, dataset, in_unit
 from s4a.seeds import RNG, seed_of
 from s4a.study.pipeline import analyse
@@ -628,8 +629,7 @@ def write(tree: xr.DataTree, folder: Path | str) -> list[Path]:
     >>> [path.name for path in paths], (folder / "truth.nc").is_file()
     (['brain_01.ply', 'brain_02.ply'], True)
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = new_folder(folder)
     truth, paths = tree["truth"].to_dataset(), []
     nodes = {"/": truth}
     for shape in truth["shape"].values:

@@ -115,6 +115,13 @@ def read_bytes(path: _AnyPath) -> bytes:
         return read_all(file)
 
 
+def new_folder(path: _AnyPath) -> Path:
+    """Return a folder, which is made if it is missing."""
+    folder = Path(path)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 def shown(text: object) -> str:
     r"""Escape unprintable characters of a path or a text.
 

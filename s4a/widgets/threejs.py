@@ -443,8 +443,7 @@ def correspondence(
     """
     if isinstance(pair, xr.DataTree):
         for name in (source, target):
-            if name not in pair["coarse"].children:
-                raise ValueError(f"two shapes of the study needed, found {name!r}")
+            check_choice("shape", name, pair["coarse"].children)
         match = latent_match(pair, source, target, dense=False)
         (X, S), (Y, T) = (study_surface(pair, name) for name in (source, target))
     else:
