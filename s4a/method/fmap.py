@@ -70,28 +70,26 @@ def wave_filter(eigenvalue: Array, *others: Array, n: int = 100) -> Array:
     return kernel / kernel.sum(axis=1, keepdims=True)
 
 
-def signature(Phi: Array, kernel: Array) -> Array:
+def signature(Phi: Array, kernel: Array, landmark: Array | None = None) -> Array:
     """Return the signature of every vertex ``(n, f)``: squared eigenfunctions times f filters.
 
     It does not depend on the signs of the eigenfunctions, and cannot distinguish the sides of a
-    symmetric shape.
+    symmetric shape.  Signatures around p landmarks ``(n, p f)`` distinguish them.
 
     Parameters
     ----------
     Phi : float ndarray (n, k)
     kernel : float ndarray (f, k)
+    landmark : int ndarray (p,), optional
     """
-    return Phi**2 @ kernel.T
+    if landmark is None:
+        return Phi**2 @ kernel.T
+    return Phi @ landmark_coefficients(Phi, kernel, landmark)
 
 
 def landmark_coefficients(Phi: Array, kernel: Array, landmark: Array) -> Array:
     """Return the coefficients ``(k, p f)`` of the signatures around p vertices with f filters."""
     return np.einsum("fk,pk->kpf", kernel, Phi[landmark]).reshape(Phi.shape[1], -1)
-
-
-def landmark_signature(Phi: Array, kernel: Array, landmark: Array) -> Array:
-    """Return signatures around p vertices ``(n, p f)``, which distinguish symmetric sides."""
-    return Phi @ landmark_coefficients(Phi, kernel, landmark)
 
 
 def hks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None = None) -> Array:
@@ -127,8 +125,7 @@ def hks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None =
     >>> hks(Phi, np.array([0.0, 9.0]), n=2, landmark=[0]).shape
     (2, 2)
     """
-    kernel = heat_filter(eigenvalue, n=n)
-    return signature(Phi, kernel) if landmark is None else landmark_signature(Phi, kernel, landmark)
+    return signature(Phi, heat_filter(eigenvalue, n=n), landmark)
 
 
 def wks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None = None) -> Array:
@@ -152,8 +149,7 @@ def wks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None =
     Aubry, M., Schlickewei, U. and Cremers, D. (2011). The wave kernel signature: a quantum
     mechanical approach to shape analysis. ICCV Workshops.
     """
-    kernel = wave_filter(eigenvalue, n=n)
-    return signature(Phi, kernel) if landmark is None else landmark_signature(Phi, kernel, landmark)
+    return signature(Phi, wave_filter(eigenvalue, n=n), landmark)
 
 
 def mean_curvature(X: Array, normals: Array, area: Array, Phi: Array, eigenvalue: Array) -> Array:
@@ -491,7 +487,7 @@ def fmap_from_wave_kernels(
     for shape, landmark in ((source, landmark_source), (target, landmark_target)):
         kernel = wave_filter(shape.eigenvalue[:n])[::EVERY]
         Phi = shape.Phi[:, :n]
-        f = np.column_stack([signature(Phi, kernel), landmark_signature(Phi, kernel, landmark)])
+        f = np.column_stack([signature(Phi, kernel), signature(Phi, kernel, landmark)])
         f /= np.sqrt(shape.area @ f**2)
         F.append(Phi[:, :k].T @ (shape.area[:, None] * f))  # (k, d)
         operators.append(multiplication(Phi[:, :k], shape.area, f))  # (d, k, k)
@@ -583,7 +579,7 @@ def fmap_from_descriptors(
         kernel = np.concatenate([values[::EVERY] for values in filters])
         descriptors = [signature(shape.Phi, kernel)]  # (n, d)
         if landmark is not None:
-            descriptors.append(landmark_signature(shape.Phi, kernel, landmark))
+            descriptors.append(signature(shape.Phi, kernel, landmark))
         descriptors += [shape.fields[name] for name in common_fields(source, target)]
         f = np.column_stack([*descriptors, *(curvatures(shape) if curvature else [])])
         f = f - shape.area @ f

@@ -48,19 +48,18 @@ class Median(Panel):
         latent = self.study["latent"].dataset
         self.names, k = names_of(latent), latent.sizes["latent"]
         norm, options = str(latent.attrs.get("norm", "h2")), labelled(self.study, self.names)
-        self.operator = self.redrawing(dropdown("operator", OPERATOR, list(OPERATORS)), self.rank)
-        self.norm = self.redrawing(dropdown("norm", NORM, list(NORMS), value=norm), self.rank)
-        size = int_slider("eigenfunctions K", EIGENFUNCTIONS, k, 2, k)
-        self.size = self.redrawing(size, self.rank)
+        self.operator = dropdown("operator", OPERATOR, list(OPERATORS))
+        self.norm = dropdown("norm", NORM, list(NORMS), value=norm)
+        self.size = int_slider("eigenfunctions K", EIGENFUNCTIONS, k, 2, k)
         resolutions = [(text, stage) for text, stage in RESOLUTIONS if has(self.study, stage)]
-        stages = dropdown("surfaces", "the resolution of the meshes", resolutions)
-        self.stage = self.redrawing(stages, self.show)
+        self.stage = dropdown("surfaces", "the resolution of the meshes", resolutions)
         self.shape = dropdown("shape", "the shape that is shown", options)
         self.bars, self.ties = Chart(), ipywidgets.HTML()
         self.scene = self.new_scene(420)
         self.on_pick(self.bars, self.pick)
         self.bind(self.shape, "selected")
-        self.redraw(self.show, "selected")
+        self.redraw(self.rank, self.operator, self.norm, self.size)
+        self.redraw(self.show, "selected", self.stage)
         self.rank()
         self.selected = self.median
         return [

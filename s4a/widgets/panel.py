@@ -216,11 +216,6 @@ class Panel(KernelWidget):
         """Return a view of a surface that rotates with the other views of the panel."""
         return Scene(height=height, **self.camera, **options)
 
-    def redrawing(self, control: ipywidgets.Widget, function: Callable[[], Any]) -> Any:
-        """Call `function` without arguments when `control` changes; return the control."""
-        self.redraw(function, control)
-        return control
-
     def follow(self) -> ipywidgets.Checkbox:
         """Return a checkbox: mark the vertex under the pointer, not only a clicked one."""
         box = checkbox("follow the pointer", FOLLOW, True)
