@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from s4a.analysis.inputs import Values, displacements_of, labels_of, registration_of
+from s4a.analysis.inputs import Values, displacements_of, registration_of
 from s4a.analysis.permutation import Model, check_permutations
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.closest import closest_facing_point, interpolate
@@ -29,6 +29,7 @@ from s4a.schema import check_choice, dataset, in_unit, require, unit_of
 from s4a.seeds import RNG, seed_of
 from s4a.study.tree import left_out
 from s4a_morphometrics.bilateral_pairs import ITERATIONS, Mirror, plane_between, symmetry
+from s4a_morphometrics.longitudinal import labels_of
 
 log = logging.getLogger(__name__)
 

@@ -233,16 +233,6 @@ def values_of(study: xr.DataTree, values: Values, what: str) -> Array:
     return _plain(values, names, what)
 
 
-def labels_of(study: xr.DataTree, values: Values, what: str) -> list[str]:
-    """Return a subject, side or other label of each shape as text, empty if it is missing."""
-    names = registration_of(study)["shape"].values.tolist()
-    found = values_of(study, values, what)
-    present = ~lacks_value(found)
-    kept = [name for name, one in zip(names, present, strict=True) if one]
-    check_column(found[present], kept, what, categories=True)
-    return [str(x) if one else "" for x, one in zip(found.tolist(), present, strict=True)]
-
-
 def _in_order(values, names, what):
     """Values in the order of the shapes, if keys or an index are names of shapes.
 

@@ -82,12 +82,6 @@ def row(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
     return ipywidgets.HBox(widgets, layout={"flex_flow": "row wrap", "align_items": "center"})
 
 
-def unbroken_row(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
-    """Return a row of widgets that does not wrap."""
-    layout = {"align_items": "center", "flex": "none", "margin": "0 1em 0 0"}
-    return ipywidgets.HBox(widgets, layout=layout)
-
-
 def columns(*widgets: ipywidgets.Widget, min_width: str = "24em") -> ipywidgets.HBox:
     """Return columns of equal width that wrap if one would be narrower than `min_width`."""
     for widget in widgets:
