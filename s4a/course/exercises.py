@@ -13,6 +13,7 @@ import numpy as np
 
 from s4a.analysis.transfer import transfer_scalars
 from s4a.datasets.synthetic import LABELS, position
+from s4a.evaluation.metrics import dice
 from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas
 from s4a.method.nearest import nearest_rows
 from s4a.method.spectral import project, reconstruct, unit_area
@@ -185,12 +186,6 @@ def _is_derangement(match, n):
     return moved and np.array_equal(np.unique(match), np.arange(n))
 
 
-def _dice(transferred, own, name):
-    """Return Dice's overlap of a region, by vertices."""
-    a, b = (labels == LABELS.index(name) for labels in (transferred, own))
-    return 2 * (a & b).sum() / (a.sum() + b.sum())
-
-
 def _cycle_error(Y, *cycle):
     """Return the cycle error of the maps through the latent space."""
     C = np.eye(Y.shape[1])
@@ -255,7 +250,7 @@ EXERCISES: dict[str, Any] = {
         mean["seconds"].sel(algorithm="FMAP+ZO") / mean["seconds"].sel(algorithm="RE-MATCH")
     ).item(),
     "10.3": lambda n: lambda match: _is_derangement(match, n),
-    "11.1": lambda labels, target: _dice(labels, target["label"].values, "cerebellum left"),
+    "11.1": lambda labels, target: dice(labels, target["label"])[LABELS.index("cerebellum left")],
     "11.2": lambda labels, target: (
         np.bincount(labels, vertex_areas(*as_arrays(target)))[LABELS.index("occipital right")] / 100
     ),

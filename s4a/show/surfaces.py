@@ -6,9 +6,6 @@ import numpy as np
 import xarray as xr
 
 from s4a.method.pca import color_limits, low_vertices
-from s4a.method.register import match_functions, match_low
-from s4a.method.shape import Shape
-from s4a.method.steps import Study, latent_bases
 from s4a.schema import INPUT, Array, unit_of
 from s4a.show.draw import cycle_error_limits
 
@@ -227,18 +224,3 @@ def network_limits(study: xr.DataTree) -> tuple[float, float]:
     network = study["network"].dataset
     keys = ("cycle_error_initial", "cycle_error")
     return cycle_error_limits(*(network[key].values for key in keys if key in network))
-
-
-def latent_match(study: xr.DataTree, source: str, target: str, *, dense: bool) -> Array:
-    """Return the vertex of `source` that the latent basis matches to each vertex of `target`.
-
-    These are nearest rows of Phi Y on the coarse meshes (eq. 3), or, if `dense`, of U Phi Y on all
-    vertices (eq. 7).
-    """
-    M, N = (
-        Shape(study["original"][name].to_dataset(), study["coarse"][name].to_dataset())
-        for name in (source, target)
-    )
-    basis_source, basis_target = latent_bases(Study(study), source, target)
-    match, (F_source, F_target) = match_low(M, N, (basis_source, basis_target))
-    return match_functions(M, N, F_source, F_target)[0] if dense else match

@@ -4,13 +4,13 @@ import ipywidgets
 import numpy as np
 import traitlets
 
+from s4a.method.steps import latent_match
 from s4a.schema import Array
 from s4a.show.browser import color_scale
 from s4a.show.draw import position_colors, ramp_colors
 from s4a.show.surfaces import (
     has,
     labelled,
-    latent_match,
     mesh_of,
     names_of,
     surface,
@@ -164,8 +164,9 @@ class Correspondence(Panel):
             return match
         key = self.source, self.shape, self.map.value
         if key not in self.matches:
-            dense = self.map.value == "dense"
-            self.matches[key] = latent_match(self.study, self.shape, self.source, dense=dense)
+            full = self.map.value == "dense"
+            found = latent_match(self.study, self.shape, self.source, full=full)
+            self.matches[key] = found["match"].values
         return self.matches[key]
 
     def reverse_match(self) -> Array:

@@ -22,13 +22,13 @@ from scipy.spatial.transform import Rotation
 
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, normal_sums, vertex_normals
+from s4a.method.steps import latent_match
 from s4a.schema import Array, check_choice, check_rows, require
 from s4a.show import draw
 from s4a.show.browser import color_scale
 from s4a.show.draw import CLAY, SIGNED, Viewpoint
 from s4a.show.surfaces import (
     has,
-    latent_match,
     mode_arrays,
     mode_limits,
     names_of,
@@ -444,7 +444,7 @@ def correspondence(
     if isinstance(pair, xr.DataTree):
         for name in (source, target):
             check_choice("shape", name, pair["coarse"].children)
-        match = latent_match(pair, source, target, dense=False)
+        match = latent_match(pair, source, target, full=False)["match"].values
         (X, S), (Y, T) = (study_surface(pair, name) for name in (source, target))
     else:
         if isinstance(pair, xr.Dataset):
