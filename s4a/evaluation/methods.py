@@ -146,13 +146,6 @@ class Spaces:
         )
 
 
-def functions_at_all_vertices(shape: Shape, C: Array | None = None) -> Array:
-    """Return the functions of a shape, or Phi C^T, at all its vertices ``(n, k)``."""
-    Phi = shape.full.Phi
-    F = Phi if C is None else Phi[:, : C.shape[1]] @ C.T.astype(Phi.dtype)
-    return shape.full.extend(F)
-
-
 def match_in_space(source: Spaces, target: Spaces, transform: tuple[Array, Array]) -> Matches:
     """Match aligned shapes by nearest neighbours in space (kNN), in both directions."""
     R, t = transform
@@ -316,8 +309,8 @@ class Pair:
         if kind == "refined":
             for _ in range(self.full_resolution_iterations):
                 C = clock("refine", refine_at_full_resolution, M, N, C, M.full.Phi)
-        F = clock("full resolution", functions_at_all_vertices, M, C)
-        G = functions_at_all_vertices(N)[:, :k]
+        F = clock("full resolution", lambda: M.full.extend(M.functions(C.T)))
+        G = N.full.extend(N.full.Phi[:, :k])
         match = low_match
         if kind != "dense":
             match, *_ = clock("full resolution", nearest_in_cells, G, N.cell, F, M.cell)

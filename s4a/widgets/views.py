@@ -20,6 +20,7 @@ from s4a.show.browser import (
     palette,
     to_bytes,
 )
+from s4a.show.charts import reach
 from s4a.show.draw import (
     SIGNED,
     checkerboard,
@@ -59,19 +60,6 @@ def round_down(x: float) -> float:
     """
     power = 10.0 ** np.floor(np.log10(x))
     return float(power * max(m for m in (1, 2, 5) if m * power <= x * (1 + 1e-9)))
-
-
-def signed_limit(values: Array) -> float:
-    """Return the end of the colour scale of a signed function ``(n,)``: the 99 % quantile of |f|.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.widgets.views import signed_limit
-    >>> signed_limit(np.array([-2.0, 2.0]))
-    2.0
-    """
-    return float(np.quantile(np.abs(values), 0.99))
 
 
 class View(anywidget.AnyWidget):
@@ -222,8 +210,8 @@ class Scene(View):
         self.draw_still()
 
     def paint_function(self, values: Array, label: str, limit: float | None = None) -> None:
-        """Colour a signed function ``(n,)`` from -`limit` to `limit` (:func:`signed_limit`)."""
-        limit = signed_limit(values) if limit is None else limit
+        """Colour a signed function ``(n,)`` from -`limit` to `limit`, the 99 % quantile."""
+        limit = reach(values, 0.99) if limit is None else limit
         self.paint(signed_colors(values, limit), color_scale(SIGNED, -limit, limit, label))
 
     def _send_colors(self, colors, coordinates, cell):
