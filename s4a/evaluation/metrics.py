@@ -209,13 +209,7 @@ def coverage(match: Array, area: Array) -> float:
     return float(area[np.unique(match)].sum() / area.sum())
 
 
-def cycle_error(
-    X: Array,
-    T: Array,
-    *matches: Array,
-    vertices: Array | None = None,
-    limit: float = 1.0,
-) -> Array:
+def cycle_error(X: Array, T: Array, *matches: Array, vertices: Array | None = None) -> Array:
     """Return the distance of vertices from their images under a cycle of matches.
 
     It sees inconsistent matches without ground truth.  It cannot see errors that cancel: a
@@ -249,7 +243,7 @@ def cycle_error(
     end = start
     for match in matches:
         end = match[end]
-    return geodesic_error(X, T, end, start, limit=limit)
+    return geodesic_error(X, T, end, start)
 
 
 def label_accuracy(label: ArrayLike, true: ArrayLike, area: Array | None = None) -> float:

@@ -426,10 +426,7 @@ def _constant_to_constant(source, target):
 
 
 def fmap_from_landmarks(
-    source: Basis,
-    target: Basis,
-    landmark_source: Array,
-    landmark_target: Array,
+    source: Basis, target: Basis, landmark_source: Array, landmark_target: Array
 ) -> Array:
     """Fit a functional map to heat kernels around landmark pairs (step 4 of 4.1).
 
@@ -458,13 +455,7 @@ def fit_to_landmarks(source: Basis, target: Basis, F: Array, G: Array) -> Array:
 
 
 def fmap_from_wave_kernels(
-    source: Basis,
-    target: Basis,
-    landmark_source: Array,
-    landmark_target: Array,
-    *,
-    k: int = 20,
-    weights: tuple[float, float, float] = (1.0, 1e-2, 1e-1),
+    source: Basis, target: Basis, landmark_source: Array, landmark_target: Array, *, k: int = 20
 ) -> Array:
     """Fit a functional map ``(k, k)`` to wave kernels as pyFM 1.3.1 does.
 
@@ -479,8 +470,6 @@ def fmap_from_wave_kernels(
         With all eigenfunctions.
     landmark_source, landmark_target : int ndarray (p,)
         Corresponding vertices.
-    weights : tuple of float
-        Weights of the three terms; only their ratios matter.
     """
     F, operators, spectra = [], [], []
     n = min(source.k, target.k)
@@ -504,7 +493,7 @@ def fmap_from_wave_kernels(
         mask.mean() * k,
         (squares - 2 * (traces[0] @ traces[1]) / k) / n_independent,
     )
-    w_descriptor, w_laplacian, w_operator = np.divide(weights, scales)
+    w_descriptor, w_laplacian, w_operator = np.divide((1.0, 1e-2, 1e-1), scales)
     root_w = np.sqrt(w_descriptor)
     constant = _constant_to_constant(source, target)
     operator = [(w_operator, *operators)]
