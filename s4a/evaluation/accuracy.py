@@ -15,6 +15,7 @@ from s4a.method import fmap
 from s4a.method.initial_map import map_after_alignment, nearest_after_alignment
 from s4a.method.nearest import nearest_of_few
 from s4a.method.shape import Shape
+from s4a.schema import Array
 from s4a.study.processes import workers
 
 ICP, ZOOMOUT = "nearest neighbour after ICP", "pairwise ZoomOut"
@@ -22,8 +23,8 @@ MATCH, SURFACE = "S4A, matched vertex", "S4A, registered surface"
 
 
 def simple_matches(
-    source: Shape, target: Shape, vertex: np.ndarray, *, k_init: int = 20
-) -> dict[str, np.ndarray]:
+    source: Shape, target: Shape, vertex: Array, *, k_init: int = 20
+) -> dict[str, Array]:
     """Return baseline matches: nearest neighbour after ICP, and ZoomOut with eq. 4 (4.1).
 
     Parameters
@@ -76,7 +77,7 @@ def _errors(source, target, registered, image, n_vertices, n_geodesic):
 
 def accuracy(
     study: xr.DataTree,
-    image: Callable[[str, str], np.ndarray],
+    image: Callable[[str, str], Array],
     *,
     n_vertices: int | None = None,
     n_geodesic: int = 0,

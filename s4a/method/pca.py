@@ -362,18 +362,16 @@ def plausible_scores(n: int, *, seed: int | None = None, limit: float = 3.0) -> 
     return scores
 
 
-def color_limits(
-    mean: Array, triangles: Array, deformation: Array, *, sigma: float = 3, n_modes: int = 3
-) -> tuple[float, float]:
-    """Return the colour limits of displacements: along the normal, and in length.
+def color_limits(mean: Array, triangles: Array, deformation: Array) -> tuple[float, float]:
+    """Return the colour limits of displacements ``(c, n, 3)``: along the normal, and in length.
 
-    The 95 % quantile over vertices and the first modes at `sigma` standard deviations, which is one
-    scale for all modes and robust to outlying vertices.
+    The 95 % quantile over vertices and modes at 3 standard deviations, which is one scale for all
+    modes and robust to outlying vertices.
     """
-    steps = deformation[:n_modes]  # (c, n, 3)
-    along = np.quantile(np.abs(normal_displacement(steps, vertex_normals(mean, triangles))), 0.95)
-    length = np.quantile(np.linalg.norm(steps, axis=2), 0.95)
-    return float(sigma * along) or 1.0, float(sigma * length) or 1.0
+    along = normal_displacement(deformation, vertex_normals(mean, triangles))
+    sizes = np.abs(along), np.linalg.norm(deformation, axis=2)
+    limit, limit_length = (float(3 * np.quantile(size, 0.95)) or 1.0 for size in sizes)
+    return limit, limit_length
 
 
 def project_scores(
