@@ -9,7 +9,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from paths import DOCS, ROOT
-from small import small_brains, small_pictures, small_searches
+from small import small_analyses, small_brains, small_pictures, small_searches
 
 import s4a
 from s4a.geometry.mesh import as_arrays
@@ -34,20 +34,12 @@ def value_of(code, names):
 def small(tmp_path, monkeypatch):
     """A folder, in which brains and low resolutions have at most so many vertices."""
 
-    def limited(function):
-        def call(*args, **options):
-            least = {"n_coarse": min(options["n_coarse"], 250)} if "n_coarse" in options else {}
-            return function(*args, **options | least)
-
-        return call
-
     monkeypatch.chdir(tmp_path)
     matplotlib.use("agg")
     small_brains(monkeypatch.setattr, 20, 800)
     small_pictures(monkeypatch.setattr)
     small_searches(monkeypatch.setattr)
-    for name in ("analyse", "match_pair", "register_pairs"):
-        monkeypatch.setattr(s4a, name, limited(getattr(s4a, name)))
+    small_analyses(monkeypatch.setattr, 250)
 
 
 def test_every_cell_of_the_gallery_runs_and_shows_a_picture(small):
