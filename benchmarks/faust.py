@@ -2,7 +2,7 @@
 
 ``faust.py [cats] [--shapes N] [--pairs N] [--seed S]``: shapes 000 to 019 of FAUST_r in the shared
 data beside the checkout, 5,000 vertices, remeshed separately; or the eleven cats of TOSCA, 27,894
-vertices, of which vertex i is vertex i, at 1,000 of them.  All ordered pairs within one study, and
+vertices, of which vertex i is vertex i, at 500 of them.  All ordered pairs within one study, and
 some pairs matched alone.
 
 ``faust.py --shrec19 FOLDER [--pairs N]``: pairs of SHREC'19, *Matching Humans with Different
@@ -30,7 +30,7 @@ from s4a.schema import dataset
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 CURVE = (1, 2, 5, 10)  # % of sqrt(area)
-N_POINTS = 1000  # of the cats
+N_POINTS = 500  # of the cats
 PUBLISHED = "| ULRSSM (Cao et al. 2023), trained on FAUST and SCAPE, 080 to 099 | | 1.6 | | | |\n"
 
 
