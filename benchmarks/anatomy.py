@@ -14,8 +14,8 @@ random shapes of the model to the nearest shape.  Its validation and test shapes
 shapes are left out one by one.  Also the mean distance of the points to the surface, in mm.
 
 The template is the median shape of the study, for all methods.  Other programs begin at the rigid
-transform that fits the registered surface of the study best, which favours them: ICP alone turns
-some femurs about their axis.  CPU seconds of one core, a shape.  What is not installed is named.
+transform that fits the registered surface of the study best, which favours them.  CPU seconds of
+one core, a shape.  What is not installed is named.
 """
 
 import argparse
