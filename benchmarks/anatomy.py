@@ -53,14 +53,14 @@ SPLEENS = (
 
 
 def zoomout(template, shape, start):
-    """ZoomOut of pyFM from nearest vertices, from 20 to 100 eigenfunctions, at 3,000 samples."""
+    """ZoomOut of pyFM from nearest vertices, with 20, 30, ... 60 eigenfunctions."""
     from pyFM.mesh import TriMesh
     from pyFM.refine.zoomout import mesh_zoomout_refine_p2p
 
     X = as_arrays(shape)[0]
-    pair = [TriMesh(*as_arrays(mesh)).process(k=100, verbose=False) for mesh in (shape, template)]
+    pair = [TriMesh(*as_arrays(mesh)).process(k=60, verbose=False) for mesh in (shape, template)]
     match = cKDTree(X).query(start)[1]
-    options = {"k_init": 20, "nit": 16, "step": 5, "subsample": 3000, "return_p2p": True}
+    options = {"k_init": 20, "nit": 4, "step": 10, "return_p2p": True}
     return X[mesh_zoomout_refine_p2p(match, *pair, **options)[1]]
 
 
