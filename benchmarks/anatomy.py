@@ -187,7 +187,7 @@ def main():
             row = " | ".join([program, str(len(images) - femurs), *cells, f"{seconds:.1f}"])
             sys.stdout.write(f"| {row} |\n")
             sys.stdout.flush()
-    missing = [program for program in programs if not is_installed(program)]
+    missing = sorted({p.split(",")[0] for p in programs if not is_installed(p)})
     sys.stdout.write(f"\nThe template is {name}. Not installed: {', '.join(missing) or 'none'}.\n")
 
 
