@@ -31,7 +31,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from peers import DATA, METHODS, OURS, within_limits
+from peers import DATA, METHODS, within_limits
 from scipy.spatial import cKDTree
 from stability import surfaces
 
@@ -66,11 +66,10 @@ def zoomout(template, shape, start):
     return X[mesh_zoomout_refine_p2p(match, *pair, **options)[1]]
 
 
-PROGRAMS = {"S4A, pairs alone": METHODS[OURS]}
-PROGRAMS |= {"nearest point after rigid alignment": METHODS["ICP, nearest point"]}
+PROGRAMS = {"nearest point after rigid alignment": METHODS["ICP, nearest point"]}
 PROGRAMS |= {name: how for name, how in METHODS.items() if name.startswith(("MeshMonk", "rustcpd"))}
 PROGRAMS |= {"pyFM, ZoomOut after rigid alignment": (zoomout,)}
-SLOW = ("S4A, pairs alone", "pyFM, ZoomOut after rigid alignment")  # left out for spleens
+SLOW = ("pyFM, ZoomOut after rigid alignment",)  # left out for spleens
 MODULES = {"MeshMonk": "meshmonk", "rustcpd": "rustcpd", "pyFM": "pyFM"}
 
 
