@@ -458,7 +458,8 @@ class Options:
         more="A flagged shape, such as a mirrored one or one in another unit, is left out of the "
         "network and of the modes.  It is registered afterwards, with the results of the others "
         "held fixed.  With 'stop' the run ends before the long stages.  With 'off' all shapes are "
-        "in the network and the modes, each can be the median, and findings are warnings")
+        "in the network and the modes, each can be the median, shapes are not compared with each "
+        "other, and what cleaning, alignment and registration find are warnings")
     include_flagged: bool = quality(False,
         "include suspect (flagged) shapes in the modes and statistics")
     # fmt: on

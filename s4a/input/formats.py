@@ -11,6 +11,7 @@ OFF 0.4, 0.8 and 0.2 s.
 """
 
 import base64
+import html
 import io
 import math
 import re
@@ -18,7 +19,6 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -222,7 +222,7 @@ def _data_array(name, values):
     width = values.shape[1] if values.ndim == 2 else 1
     raw = np.array(values.nbytes, "<u8").tobytes() + np.ascontiguousarray(values).tobytes()
     return (
-        f"<DataArray type={quoteattr(kind)} Name={quoteattr(name)} "
+        f'<DataArray type="{kind}" Name="{html.escape(name)}" '
         f'NumberOfComponents="{width}" format="binary">'
         f"{base64.b64encode(raw).decode()}</DataArray>\n"
     )

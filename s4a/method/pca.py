@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy.linalg import eigh
 
 from s4a.geometry.mesh import vertex_normals
 from s4a.method.deform import normal_displacement, smoother
@@ -91,7 +92,7 @@ def parts(fields: Array | xr.Variable) -> Iterator[tuple[slice, Array]]:
 
 def center_gram(K: Array) -> Array:
     """Centre a Gram matrix ``(s, s)``, as if the mean were subtracted from the fields."""
-    return K - K.mean(0) - K.mean(1)[:, None] + K.mean()
+    return K - K.mean(0) - K.mean(1)[:, None] + K.mean(0).mean()
 
 
 def principal_components(K: Array) -> tuple[Array, Array]:
@@ -102,12 +103,13 @@ def principal_components(K: Array) -> tuple[Array, Array]:
 
     See Also
     --------
-    sklearn.decomposition.KernelPCA : The implementation.
+    sklearn.decomposition.KernelPCA : The same; its import takes longer than a small analysis.
     """
-    from sklearn.decomposition import KernelPCA  # here, as the import takes 0.2 s
-
-    fitted = KernelPCA(kernel="precomputed", eigen_solver="dense").fit(K)
-    return fitted.eigenvalues_ / (len(K) - 1), fitted.eigenvectors_
+    values, vectors = eigh(center_gram(K))
+    order = np.flatnonzero(values > 1e-12 * values[-1])[::-1]
+    V = vectors[:, order]
+    V *= np.sign(V[np.abs(V).argmax(0), np.arange(len(order))])  # eigenvectors have no sign
+    return values[order] / (len(K) - 1), V
 
 
 def gram_pca(fields: Array | xr.Variable, area: Array) -> _PrincipalModes:

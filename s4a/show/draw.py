@@ -105,10 +105,11 @@ def rasterise(P: Array, T: Array, width: int, height: int) -> tuple[Array, Array
         Barycentric weights in that triangle.
     depth : float32 ndarray (s,)
     """
-    corners = P[T][..., :2]  # (m, 3, 2)
+    a, b, c = corners = [P[:, :2].take(corner, axis=0) for corner in T.T]  # (m, 2) each
     # the box of the samples whose centres may lie in the triangle
-    low = np.maximum(np.ceil(corners.min(1) - 0.5), 0).astype(np.int64)
-    high = np.floor(corners.max(1) - 0.5)
+    low = np.ceil(np.minimum(np.minimum(a, b), c) - 0.5)
+    low = np.maximum(low, 0).astype(np.int64)
+    high = np.floor(np.maximum(np.maximum(a, b), c) - 0.5)
     high = np.minimum(high, (width - 1, height - 1)).astype(np.int64)
     box = np.maximum(high - low + 1, 0)
     samples = box[:, 0] * box[:, 1]
@@ -125,9 +126,10 @@ def rasterise(P: Array, T: Array, width: int, height: int) -> tuple[Array, Array
         count = samples[part]
         owner = np.repeat(part, count)  # the triangle of each sample of its box
         index = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)  # in the box
-        dy, dx = np.divmod(index, box[owner, 0])
-        wb = start[owner, 0] + slopes[owner, 0] * dx + slopes[owner, 1] * dy
-        wc = start[owner, 1] + slopes[owner, 2] * dx + slopes[owner, 3] * dy
+        dy, dx = np.divmod(index, np.repeat(box[part, 0], count))
+        planes = np.repeat(np.c_[start[part], slopes[part]], count, axis=0).T
+        wb = planes[0] + planes[2] * dx + planes[3] * dy
+        wc = planes[1] + planes[4] * dx + planes[5] * dy
         inside = np.flatnonzero((wb >= 0) & (wc >= 0) & (wb + wc <= 1))
         owner, wb, wc = owner[inside], wb[inside], wc[inside]
         sample = (low[owner, 1] + dy[inside]) * width + low[owner, 0] + dx[inside]
@@ -192,7 +194,7 @@ def _weight_planes(corners, low):
     start : float32 ndarray (m, 2)
         Both weights at the first sample of the box.
     """
-    ax, ay, bx, by, cx, cy = corners.reshape(-1, 6).T
+    (ax, ay), (bx, by), (cx, cy) = (corner.T for corner in corners)
     double_area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
     scale = 1 / np.where(double_area == 0, 1, double_area)
     slopes = np.stack([cy - ay, ax - cx, ay - by, bx - ax], axis=1) * scale[:, None]

@@ -51,7 +51,13 @@ def mode_pictures(
     draw = _modes(study, np.arange(1, 1 + n_modes), view, up)
     frame = _frames([draw((-SIGMA, SIGMA))], True)[0]
     options = {"view": "top", "size": size, "frame": frame}
-    pictures = [render(c.points, c.triangles, colors=c.colors, **options) for c in draw(scores)]
+    pictures: list[np.ndarray] = []
+    for i, cell in enumerate(draw(scores)):
+        column = i % len(scores)
+        if column < i and scores[column] == 0:  # the mean is the same in all rows
+            pictures.append(pictures[column])
+        else:
+            pictures.append(render(cell.points, cell.triangles, colors=cell.colors, **options))
     return [pictures[i : i + len(scores)] for i in range(0, len(pictures), len(scores))]
 
 
