@@ -487,7 +487,7 @@ def _brain(truth, shape, n_vertices, seed, dirty):
     """Return points, triangles and reference points of one shape of :func:`brains`."""
     clean, artefacts = (np.random.default_rng([seed, i, _index(truth, shape)]) for i in (1, 2))
     brain = _clean_brain(truth, shape, n_vertices, clean)
-    return _add_artefacts(*brain, artefacts) if dirty else brain
+    return _add_artefacts(*brain, rng=artefacts) if dirty else brain
 
 
 def labels(reference_point: ArrayLike) -> Array:
