@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-ipywidgets = pytest.importorskip("ipywidgets")
 pytest.importorskip("anywidget")
+import ipywidgets
 from IPython.core.interactiveshell import ExecutionInfo, InteractiveShell
 from ipywidgets.widgets import widget as registry  # the open widgets are counted in it
 from matplotlib.colors import to_rgb
