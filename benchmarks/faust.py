@@ -1,7 +1,8 @@
-"""Bodies by the published protocols: FAUST_r, and the connectivity track of SHREC'19.
+"""Bodies and cats by the published protocols: FAUST_r, TOSCA, the connectivity track of SHREC'19.
 
-``faust.py [--shapes N] [--pairs N] [--seed S]``: shapes 000 to 019 of FAUST_r in the shared data
-beside the checkout, 5,000 vertices, remeshed separately.  All ordered pairs within one study, and
+``faust.py [cats] [--shapes N] [--pairs N] [--seed S]``: shapes 000 to 019 of FAUST_r in the shared
+data beside the checkout, 5,000 vertices, remeshed separately; or the eleven cats of TOSCA, 27,894
+vertices, of which vertex i is vertex i, at 500 of them.  All ordered pairs within one study, and
 some pairs matched alone.
 
 ``faust.py --shrec19 FOLDER [--pairs N]``: pairs of SHREC'19, *Matching Humans with Different
@@ -27,19 +28,30 @@ from scipy.spatial import cKDTree
 import s4a
 from s4a.schema import dataset
 
-DATA = Path(__file__).parents[2] / "shared" / "data" / "faust_r"
+DATA = Path(__file__).parents[2] / "shared" / "data"
 CURVE = (1, 2, 5, 10)  # % of sqrt(area)
-PUBLISHED = "| ULRSSM (Cao et al. 2023), trained on FAUST and SCAPE, 080 to 099 | | 1.6 | | | |"
+N_POINTS = 500  # of the cats
+PUBLISHED = "| ULRSSM (Cao et al. 2023), trained on FAUST and SCAPE, 080 to 099 | | 1.6 | | | |\n"
 
 
 def faust_r(n):
     """The first shapes of FAUST_r: meshes by name, and vertices (5000,) that correspond."""
     meshes, true = {}, {}
-    for file in sorted(DATA.glob("*.npz"))[:n]:
+    for file in sorted((DATA / "faust_r").glob("*.npz"))[:n]:
         with np.load(file) as kept:
             true[file.stem] = kept["corres"]
             meshes[file.stem] = kept["vertices"].astype(float), kept["faces"]
     return meshes, true
+
+
+def cats(n):
+    """The first cats of TOSCA, in the same form; some of their vertices, the same on all."""
+    with np.load(DATA / "tosca" / "cat.npz") as kept:
+        names = [name.removesuffix(".off") for name in kept["names"][:n].tolist()]
+        meshes = {name: (kept["V"][i].astype(float), kept[f"F{i}"]) for i, name in enumerate(names)}
+        n_vertices = kept["V"].shape[1]
+    at = np.sort(np.random.default_rng(0).choice(n_vertices, N_POINTS, replace=False))
+    return meshes, dict.fromkeys(names, at)
 
 
 def shrec19(folder):
@@ -90,9 +102,8 @@ def say(name, rows, seconds):
     sys.stdout.flush()
 
 
-def report_faust(n, n_pairs, seed):
-    """Print the rows of FAUST_r."""
-    meshes, true = faust_r(n)
+def report(meshes, true, n_pairs, seed):
+    """Print the rows of a collection: of all pairs in one study, and of some alone."""
     points = {name: X[true[name]] for name, (X, _) in meshes.items()}
     begin = time.process_time()
     study = s4a.analyse(meshes, n_jobs=1, include_flagged=True)
@@ -103,7 +114,7 @@ def report_faust(n, n_pairs, seed):
         sources = [name for name in meshes if name != target]
         found = errors(*mesh, [images[name][target] for name in sources], true[target])
         within |= {(name, target): row for name, row in zip(sources, found, strict=True)}
-    say(f"one study of {n} shapes", list(within.values()), seconds)
+    say(f"one study of {len(meshes)} shapes", list(within.values()), seconds)
     chosen = list(within)
     np.random.default_rng(seed).shuffle(chosen)
     chosen, single, spent = chosen[:n_pairs], [], 0.0
@@ -127,6 +138,7 @@ def report_shrec19(folder, n_pairs):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("set", nargs="?", choices=("faust_r", "cats"), default="faust_r")
     parser.add_argument("--shapes", type=int, default=20)
     parser.add_argument("--pairs", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0)
@@ -138,8 +150,9 @@ def main():
     if args.shrec19:
         report_shrec19(args.shrec19, args.pairs)
         return
-    report_faust(args.shapes, args.pairs, args.seed)
-    sys.stdout.write(PUBLISHED + "\n")
+    read = cats if args.set == "cats" else faust_r
+    report(*read(args.shapes), args.pairs, args.seed)
+    sys.stdout.write("" if args.set == "cats" else PUBLISHED)
 
 
 if __name__ == "__main__":

@@ -350,12 +350,12 @@ def test_the_registered_surface_is_four_times_more_accurate_than_nearest_neighbo
     tree = synthetic.brains(3, 3000)
     truth = tree["truth"]
     result = analyse(tree, n_coarse=1200, k=60, n_jobs=1)
-    errors = accuracy.accuracy(
-        result,
-        lambda shape, template: synthetic.position(
-            truth, shape, truth[template]["reference_point"].values
-        ),
-    )["error"]
+
+    def image(shape, template):
+        return synthetic.position(truth, shape, truth[template]["reference_point"].values)
+
+    errors, sampled = (accuracy.accuracy(result, image, n_vertices=n)["error"] for n in (None, 750))
+    assert sampled.mean("shape").values == pytest.approx(errors.mean("shape").values, rel=0.05)
     methods = (accuracy.SURFACE, accuracy.MATCH, accuracy.ZOOMOUT, accuracy.ICP)
     surface, matched, zoomout, icp = (errors.sel(algorithm=m).values for m in methods)
     assert surface.mean() < icp.mean() / 4
