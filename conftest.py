@@ -196,8 +196,9 @@ def pytest_terminal_summary(terminalreporter):
 # files that take long begin first, the longest before all, so that no worker waits for the other
 SLOW = """
 notebooks browser site pages interruptions faults panels_browser widgets several complete pipeline
-scenes_browser quality_control reflect scalable_study leave_one_out insert study_files labels cli
-landmarks cluster asymmetry subjects plausibility initial_map steps compare two_block save_browser
+scenes_browser quality_control in_browser release leave_one_out scalable_study insert cluster fuzz
+extension properties study_files labels cli landmarks reflect preset asymmetry subjects plausibility
+features raw initial_map steps compare two_block save_browser touch_browser
 """.split()
 
 

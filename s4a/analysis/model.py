@@ -142,7 +142,9 @@ def downdate(d: Array, z: Array, rho: float) -> tuple[Array, Array]:
         size = w.sum()
         # LAPACK has the eigenvalues root^2 of far^2 + size z z^T; difference is far - root
         found = (dlasd4(j, far, np.sqrt(w / size), size) for j in range(len(far)))
-        difference, root, total, _ = map(np.array, zip(*found, strict=True))
+        difference, root, total, failed = map(np.array, zip(*found, strict=True))
+        if failed.any():
+            raise ArithmeticError(f"{failed.sum()} of {len(far)} eigenvalues were not found")
         gap = difference * total if len(far) > 1 else -size
         eigenvalue[changes] = d[changes][0] - root**2
         along[changes] = np.sqrt(rho / (w / gap**2).sum(-1))

@@ -486,8 +486,8 @@ def _clean_brain(truth, shape, n_vertices, rng):
 def _brain(truth, shape, n_vertices, seed, dirty):
     """Return points, triangles and reference points of one shape of :func:`brains`."""
     clean, artefacts = (np.random.default_rng([seed, i, _index(truth, shape)]) for i in (1, 2))
-    brain = _clean_brain(truth, shape, n_vertices, clean)
-    return _add_artefacts(*brain, artefacts) if dirty else brain
+    X, T, u = _clean_brain(truth, shape, n_vertices, clean)
+    return _add_artefacts(X, T, u, artefacts) if dirty else (X, T, u)
 
 
 def labels(reference_point: ArrayLike) -> Array:

@@ -8,6 +8,7 @@ from joblib import delayed
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
+from s4a.analysis.transfer import image_in_shape
 from s4a.evaluation.metrics import geodesic_error
 from s4a.geometry.align import align
 from s4a.geometry.mesh import as_arrays
@@ -57,10 +58,8 @@ def _errors(source, target, registered, image, n_vertices, n_geodesic):
     with threadpool_limits(1):
         matches = simple_matches(source, target, vertex)
         matches[MATCH] = registered["registered_match"].values[vertex]
-        R, t, s = (registered[v].values for v in ("rotation", "translation", "scale"))
-        moved = target.original["position"].values + registered["displacement"].values
         images = {name: X[match] for name, match in matches.items()}
-        images[SURFACE] = (moved[vertex] - t) @ R / s
+        images[SURFACE] = image_in_shape(target.original["position"].values, registered)[vertex]
         errors = {
             name: [np.linalg.norm(X_image - image, axis=1).mean() / size, np.nan]
             for name, X_image in images.items()

@@ -43,7 +43,7 @@ from s4a.method.register import latent_functions, log_area_ratio, match_function
 from s4a.method.shape import Basis, Shape
 from s4a.options import PRESETS as STUDY_PRESETS
 from s4a.options import Options, apply_preset
-from s4a.schema import Array, check_choice, check_count, check_switch, dataset, variable
+from s4a.schema import Array, check_choice, check_count, check_rows, check_switch, dataset, variable
 from s4a.seeds import RNG, seed_of
 
 log = logging.getLogger(__name__)
@@ -110,13 +110,10 @@ def ground_truth_in_meshes(truth: Array, source: xr.Dataset, target: xr.Dataset)
     source, target : Dataset
         From :func:`s4a.read_shape`.
     """
-    truth, n = np.asarray(truth), target.sizes["file_vertex_index"]
-    if truth.shape not in ((n,), (n, 3)) or (truth.ndim == 1 and truth.dtype.kind not in "iu"):
-        raise ValueError(
-            f"truth needs a row of the source's file (integer, -1 if unknown) or a "
-            f"position for each of the {n} vertices of the target's "
-            f"file; found {truth.dtype} of shape {truth.shape}"
-        )
+    n = target.sizes["file_vertex_index"]
+    truth = check_rows("truth", truth, (n,), (n, 3), of="vertices of the target's file")
+    if truth.ndim == 1 and truth.dtype.kind not in "iu":
+        raise ValueError(f"truth needs integers, rows of the source's file; found {truth.dtype}")
     truth = truth[target["file_vertex"].values]
     return truth if truth.ndim == 2 else in_mesh(truth, source)
 

@@ -350,19 +350,14 @@ def true_positions(truth: ArrayLike, X: Array, n: int) -> tuple[Array, Array]:
     >>> position[0].tolist(), vertex.tolist()
     ([0.0, 1.0, 0.0], [1, -1])
     """
-    truth = np.asarray(truth)
-    if truth.shape == (n,) and truth.dtype.kind in "iu":
-        if truth.max(initial=-1) >= len(X):
+    truth = check_rows("truth", truth, (n,), (n, 3), of="vertices of the target")
+    if truth.ndim == 1:
+        if truth.dtype.kind not in "iu" or truth.max(initial=-1) >= len(X):
             raise ValueError(
-                f"truth must hold vertices of the source, below {len(X)}; found {truth.max()}"
+                f"truth needs vertices of the source, integers below {len(X)}, or -1 where it is "
+                f"unknown; found {truth.dtype} up to {truth.max()}"
             )
         return np.where(truth[:, None] >= 0, X[truth], np.nan), truth
-    if truth.shape != (n, 3):
-        raise ValueError(
-            f"truth needs, for each of the {n} vertices of the target, a vertex of the source "
-            f"(integers, -1 where unknown) or a position (n, 3); "
-            f"found {truth.dtype} of shape {truth.shape}"
-        )
     known = np.isfinite(truth).all(axis=1)
     vertex = np.full(n, -1)
     vertex[known] = cKDTree(X).query(truth[known])[1]

@@ -51,7 +51,7 @@ def mode_pictures(
     draw = _modes(study, np.arange(1, 1 + n_modes), view, up)
     frame = _frames([draw((-SIGMA, SIGMA))], True)[0]
     options = {"view": "top", "size": size, "frame": frame}
-    pictures: list[np.ndarray] = []
+    pictures: list[Array] = []
     for i, cell in enumerate(draw(scores)):
         column = i % len(scores)
         if column < i and scores[column] == 0:  # the mean is the same in all rows

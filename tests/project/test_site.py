@@ -16,10 +16,17 @@ nbformat = pytest.importorskip("nbformat")
 for needed in ("furo", "latex2mathml", "myst_nb", "nbconvert", "sphinx"):
     pytest.importorskip(needed)
 slides = script(DOCS / "slides.py")
-# without the grammar of addresses that jsonschema would make, which takes seconds
+# without what takes seconds and changes no warning: the grammar of addresses that jsonschema would
+# make, and the search of the code for docstrings of attributes, of which there are none
 SPHINX = """import sys
 sys.modules["rfc3987_syntax"] = None
+from sphinx import pycode
 from sphinx.cmd.build import main
+
+def analyze(self):
+    raise pycode.PycodeError("not analysed")
+
+pycode.ModuleAnalyzer.analyze = analyze
 sys.exit(main(sys.argv[1:]))"""
 
 

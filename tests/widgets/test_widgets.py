@@ -16,6 +16,7 @@ import pytest
 import xarray as xr
 
 pytest.importorskip("anywidget")
+import ipywidgets
 from IPython.core.interactiveshell import ExecutionInfo, InteractiveShell
 from ipywidgets.widgets import widget as registry  # the open widgets are counted in it
 from matplotlib.colors import to_rgb
@@ -957,6 +958,14 @@ def test_a_page_records_the_output_for_every_value_of_its_controls(study, panel,
     recorded = data["values"][group["rows"][",".join(str(choice[name]) for name in order)][slot]]
     fmap.pair, fmap.kind.value, fmap.k.value = 7, "zoomout", 15
     assert base64.b64decode(json.loads(recorded)["base64"]) == fmap.matrix.values
+
+
+def test_of_a_long_slider_some_values_both_ends_and_the_current_one_are_recorded(monkeypatch):
+    monkeypatch.setattr(panel_page, "N_VALUES", 3)
+    slider = ipywidgets.IntSlider(5, 0, 10)
+    assert panel_page.Control(slider, "k", every=False).values == [0, 4, 5, 8, 10]
+    assert panel_page.Control(slider, "k", every=True).values == [*range(11)]
+    slider.close()
 
 
 def test_a_full_page_lists_what_is_not_recorded(panel, tmp_path):
