@@ -9,9 +9,10 @@ BIN := $(VENV)/bin
 demo: $(VENV)/.core
 	$(BIN)/s4a demo
 
-# one process a core and one more, as tests wait for browsers and processes now and then; one thread a process
+# one process a core and one more, as tests wait for browsers and processes now and then; one thread a process; with
+# bytecode, even where the shell forbids it, as many tests start Python
 WORKERS = $$($(BIN)/python -c "import os; print(os.cpu_count() + 1)")
-PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+PYTEST = PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 test: check
 	$(PYTEST)
 

@@ -36,9 +36,15 @@ def example(request):
     request.node.dtest.globs.clear()
     monkeypatch = request.getfixturevalue("monkeypatch")
     monkeypatch.setattr(tempfile, "tempdir", str(request.getfixturevalue("tmp_path")))
-    if any("example_study" in example.source for example in request.node.dtest.examples):
+    source = "".join(example.source for example in request.node.dtest.examples)
+    if "example_study" in source:
         study = request.getfixturevalue("example_study")
         monkeypatch.setattr(synthetic, "example_study", lambda: study)
+    if "example_structures" in source and "synthetic" not in request.node.path.stem:
+        from s4a_morphometrics import open_structures
+
+        several = open_structures(request.getfixturevalue("structures_folder")).load()
+        monkeypatch.setattr("s4a_morphometrics.synthetic.example_structures", lambda: several)
 
 
 @pytest.fixture(scope="session")

@@ -98,11 +98,8 @@ computing = partial(option, group="computing")
 
 def check_components(components: Any) -> str | int:
     """Return `components`; raise ValueError unless "largest", "all" or a positive number."""
-    if (
-        not isinstance(components, bool)
-        and isinstance(components, Integral)
-        and int(components) >= 1
-    ):
+    is_number = isinstance(components, Integral) and not isinstance(components, bool)
+    if is_number and components >= 1:
         return int(components)
     if isinstance(components, str) and components in ("largest", "all"):
         return components
@@ -134,27 +131,22 @@ def check_label(label: Any) -> int | str | None:
     """
     if label is None:
         return None
-    known: int | str = "all"
-    if label != "all":
-        try:
-            given: Any = label.split(",") if isinstance(label, str) else label
-            numbers = [given] if isinstance(given, Integral) else list(given)
-            if any(isinstance(one, bool | float) for one in numbers):
-                raise ValueError
-            wanted = sorted({int(one) for one in numbers})
-        except (TypeError, ValueError):
-            wanted = []
-        if not wanted or 0 in wanted:
-            raise ValueError(
-                f"label needs a number other than 0, several (1,2) or 'all'; found {label!r}"
-            )
-        known = wanted[0] if len(wanted) == 1 else ",".join(map(str, wanted))
+    is_several = isinstance(label, Iterable) and not isinstance(label, str)
+    text = ",".join(map(str, label)) if is_several else str(label)
+    is_numbers = re.fullmatch(r" *[-+]?\d+ *(, *[-+]?\d+ *)*", text)
+    numbers = sorted({*map(int, text.split(","))}) if is_numbers else [0]
+    if text != "all" and 0 in numbers:
+        raise ValueError(
+            f"label needs a number other than 0, several (1,2) or 'all'; found {label!r}"
+        )
     if find_spec("skimage") is None:
         raise ValueError(
             "surfaces from label volumes need scikit-image, which is not installed; "
             "run: pip install 's4a[labels]'"
         )
-    return known
+    if text == "all":
+        return text
+    return numbers[0] if len(numbers) == 1 else ",".join(map(str, numbers))
 
 
 def check(name: str, value: Any) -> Any:
@@ -466,7 +458,8 @@ class Options:
         more="A flagged shape, such as a mirrored one or one in another unit, is left out of the "
         "network and of the modes.  It is registered afterwards, with the results of the others "
         "held fixed.  With 'stop' the run ends before the long stages.  With 'off' all shapes are "
-        "in the network and the modes, each can be the median, and findings are warnings")
+        "in the network and the modes, each can be the median, shapes are not compared with each "
+        "other, and what cleaning, alignment and registration find are warnings")
     include_flagged: bool = quality(False,
         "include suspect (flagged) shapes in the modes and statistics")
     # fmt: on

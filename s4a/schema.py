@@ -603,6 +603,25 @@ def check_indices(name: str, values: np.ndarray, sizes: Mapping[str, int]) -> No
         raise ValueError(f"{name} needs indices {least}..{end} of {dim}, found {low}..{high}")
 
 
+def check_rows(
+    name: str, values: ArrayLike, *shapes: tuple[int, ...], of: str = "vertices"
+) -> Array:
+    """Return values as an array; raise ValueError unless it has one of the shapes.
+
+    Examples
+    --------
+    >>> from s4a.schema import check_rows
+    >>> check_rows("label", [1, 2], (3,))
+    Traceback (most recent call last):
+    ValueError: label needs a value for each of the 3 vertices, shape (3,); found shape (2,)
+    """
+    values = np.asarray(values)
+    if values.shape not in shapes:
+        needed = f"the {shapes[0][0]} {of}, shape {' or '.join(map(str, dict.fromkeys(shapes)))}"
+        raise ValueError(f"{name} needs a value for each of {needed}; found shape {values.shape}")
+    return values
+
+
 def check_switch(name: str, value: object) -> None:
     """Raise ValueError unless an option is True or False."""
     if not isinstance(value, bool | np.bool_):
@@ -624,8 +643,8 @@ def check_choice(name: str, value: object, legal: Collection[object]) -> None:
         raise ValueError(f"{name} must be one of {choices}; found {value!r}")
 
 
-def check_count(name: str, value: object, least: int = 0) -> None:
-    """Raise ValueError unless an option is an integer from `least` to :data:`LARGEST_COUNT`.
+def check_count(name: str, value: object, least: int = 0, most: int = LARGEST_COUNT) -> None:
+    """Raise ValueError unless an option is an integer from `least` to `most`.
 
     Examples
     --------
@@ -634,10 +653,8 @@ def check_count(name: str, value: object, least: int = 0) -> None:
     Traceback (most recent call last):
     ValueError: n_pairs must be an integer of at most 2147483647; found a larger one
     """
-    if isinstance(value, int | np.integer) and value > LARGEST_COUNT:
-        raise ValueError(
-            f"{name} must be an integer of at most {LARGEST_COUNT}; found a larger one"
-        )
+    if isinstance(value, int | np.integer) and value > most:
+        raise ValueError(f"{name} must be an integer of at most {most}; found a larger one")
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name} must be an integer of at least {least}; found {value!r}")
 

@@ -11,9 +11,10 @@ FLAGS = [
 
 
 def without_pictures(patch):
-    """Let pages have pictures of a few pixels."""
-    from s4a.show import page, pictures
+    """Let pages have pictures of a few pixels, and charts that are made but not drawn."""
+    from s4a.show import charts, page, pictures
 
+    patch.setattr(charts, "svg", lambda figure: b"<svg/>")
     for module in (page, pictures):
         patch.setattr(module, "render", lambda *a, **options: np.zeros((2, 2, 4), np.uint8))
     if find_spec("anywidget"):
@@ -32,9 +33,11 @@ def small_pictures(patch, figures=(72, 60), pages=None):
 
 
 def small_searches(patch):
-    """Let partial shapes be matched by fewer points, from fewer initialisations."""
+    """Let partial shapes be matched by fewer points, and shapes be compared with fewer others."""
+    from s4a.input import plausibility
     from s4a_morphometrics import part
 
+    patch(plausibility.pick_references, "__defaults__", (2,))
     for name, value in {"N_POINTS": 300, "N_ANCHORS": 3, "N_ROUGH": 80}.items():
         patch(part, name, value)
 
@@ -48,11 +51,29 @@ def small_brains(patch, most_shapes, most_vertices):
     patch(synthetic, "brains", few)
 
 
+def small_analyses(patch, n_coarse):
+    """Let low resolutions have at most so many vertices."""
+    import s4a
+
+    def limited(function):
+        def call(*args, **options):
+            least = (
+                {"n_coarse": min(options["n_coarse"], n_coarse)} if "n_coarse" in options else {}
+            )
+            return function(*args, **options | least)
+
+        return call
+
+    for name in ("analyse", "match_pair", "register_pairs"):
+        patch(s4a, name, limited(getattr(s4a, name)))
+
+
 def launch(argv):
     """Run a kernel in which pictures, collections and searches are small."""
     from ipykernel.kernelapp import launch_new_instance
 
-    small_pictures(setattr)
+    small_pictures(setattr, pages=(40, 32))
     small_searches(setattr)
-    small_brains(setattr, 8, 2500)
+    small_brains(setattr, 6, 1000)
+    small_analyses(setattr, 200)
     launch_new_instance(argv)

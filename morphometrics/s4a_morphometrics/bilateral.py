@@ -17,18 +17,19 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from s4a.analysis.inputs import Values, displacements_of, labels_of, registration_of
-from s4a.analysis.permutation import Model, check_count
+from s4a.analysis.inputs import Values, displacements_of, registration_of
+from s4a.analysis.permutation import Model, check_permutations
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.closest import closest_facing_point, interpolate
 from s4a.geometry.mesh import as_arrays, as_dataset, edges, vertex_areas, vertex_normals
 from s4a.input.subjects import listed
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import gram, gram_pca
-from s4a.schema import dataset, in_unit, require, unit_of
+from s4a.schema import check_choice, dataset, in_unit, require, unit_of
 from s4a.seeds import RNG, seed_of
 from s4a.study.tree import left_out
 from s4a_morphometrics.bilateral_pairs import ITERATIONS, Mirror, plane_between, symmetry
+from s4a_morphometrics.longitudinal import labels_of
 
 log = logging.getLogger(__name__)
 
@@ -231,9 +232,8 @@ def asymmetry(
     (('vertex', 'xyz'), 1.0)
     """
     seed = seed_of(seed, rng)
-    check_count(n_permutations)
-    if of not in ("vector", "normal"):
-        raise ValueError(f"of must be 'vector' or 'normal', found {of!r}")
+    check_permutations(n_permutations)
+    check_choice("of", of, ("vector", "normal"))
     if (subject is None) != (side is None):
         raise ValueError("matching symmetry needs both subject and side; give both or none")
     registration, d, area = displacements_of(study)
@@ -400,7 +400,7 @@ def sides_test(K: np.ndarray, model: Model) -> tuple[float, float]:
     Examples
     --------
     >>> import numpy as np
-    >>> from s4a.analysis.permutation import Model
+    >>> from s4a.analysis.permutation import Model, check_permutations
     >>> from s4a_morphometrics.bilateral import sides_test
     >>> a = 1 + 0.1 * np.arange(6.0)
     >>> sides_test(np.outer(a, a), Model.one_sample(6))[1]

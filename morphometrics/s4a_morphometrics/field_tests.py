@@ -6,7 +6,7 @@ import xarray as xr
 
 from s4a.analysis.effects import compare_groups, map_groups, regress
 from s4a.analysis.inputs import Values
-from s4a.analysis.permutation import check_count, check_options
+from s4a.analysis.permutation import check_options
 from s4a.analysis.statistics import classify_sample
 from s4a.seeds import RNG, seed_of
 from s4a_morphometrics.fields import field_sample
@@ -235,7 +235,6 @@ def field_classify(
     >>> result.attrs["chance"]
     0.5
     """
-    check_count(n_permutations)
     on_field = field_sample(study, field, group, "group")
     return classify_sample(
         on_field.sample, estimator, n_components, n_folds, n_permutations, seed_of(seed, rng)

@@ -23,9 +23,10 @@ from s4a.analysis.effects import (
     squared_cohen_f,
     vertex_results,
 )
-from s4a.analysis.inputs import Values, labels_of, registration_of, sample_of
+from s4a.analysis.inputs import Values, lacks_value, registration_of, sample_of, values_of
 from s4a.analysis.model import count_components
 from s4a.analysis.permutation import Model, check_options, standardize
+from s4a.input.columns import check_column
 from s4a.input.subjects import listed
 from s4a.method.pca import gram, principal_components
 from s4a.schema import dataset, in_unit
@@ -37,6 +38,16 @@ log = logging.getLogger(__name__)
 RATIOS = np.r_[0, np.geomspace(1e-3, 1e6, 37)]  # grid of variance ratios for the search
 STEPS = 60  # golden-section steps: 1e-12 of a grid interval
 GOLDEN = (np.sqrt(5) - 1) / 2
+
+
+def labels_of(study: xr.DataTree, values: Values, what: str) -> list[str]:
+    """Return a subject, side or other label of each shape as text, empty if it is missing."""
+    names = registration_of(study)["shape"].values.tolist()
+    found = values_of(study, values, what)
+    present = ~lacks_value(found)
+    kept = [name for name, one in zip(names, present, strict=True) if one]
+    check_column(found[present], kept, what, categories=True)
+    return [str(x) if one else "" for x, one in zip(found.tolist(), present, strict=True)]
 
 
 class Mixed(NamedTuple):

@@ -28,7 +28,7 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from s4a.analysis.inputs import registration_of
-from s4a.analysis.permutation import check_count
+from s4a.analysis.permutation import check_permutations
 from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
@@ -277,7 +277,7 @@ def structures(
     (1.0, 6)
     """
     seed = seed_of(seed, rng)
-    check_count(n_permutations)
+    check_permutations(n_permutations)
     check_switch("remove_size", remove_size)
     names = structure_names(study)
     registered = {name: registration_of(of_structure(study, name)) for name in names}

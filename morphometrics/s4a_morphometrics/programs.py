@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from s4a.analysis.export import map_to_scan, write_dataset, write_table
+from s4a.analysis.export import map_to_scan, write_dataset
 from s4a.analysis.inputs import registration_of
 from s4a.analysis.transfer import image_in_shape, transfer_labels, transfer_landmarks
 from s4a.analysis.volumes import write_label_volumes
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_normals
-from s4a.input.annotations import write_landmarks
+from s4a.input.annotations import write_landmarks, write_rows
 from s4a.input.coordinates import CoordinateSystem, moved, turned
 from s4a.input.files import write_mesh
 from s4a.input.formats import vtp_bytes
@@ -350,7 +350,7 @@ def write_r(study: xr.DataTree, folder: Path | str, *, n_points: int = N_POINTS)
     if "pca" in study.children:
         scores = study["pca"].to_dataset()["score"].sel(shape=names).values
         columns |= {f"component_{i}": score.tolist() for i, score in enumerate(scores.T, 1)}
-    write_table(paths[2], columns, zip(*columns.values(), strict=True))
+    write_rows(paths[2], [columns, *zip(*columns.values(), strict=True)])
     paths[3].write_text(R_SCRIPT, encoding="utf-8")
     return paths
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from s4a.cli.commands import SYSTEM, exit_code, new_folder, on_cluster, within, write
+from s4a.cli.commands import SYSTEM, exit_code, on_cluster, within, write
 from s4a.cli.flags import Command, add_options, whole
 from s4a.options import DECLARED
 
@@ -37,6 +37,7 @@ def insert(args: Namespace) -> int:
     """Register new subjects to the studies of several structures, which stay unchanged."""
     from s4a.analysis.export import write_registered
     from s4a.cli.tables import inserted_table
+    from s4a.input.raw import new_folder
     from s4a.study.tree import write_inserted
     from s4a_morphometrics.several import insert_structures, open_structures
 

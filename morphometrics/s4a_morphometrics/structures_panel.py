@@ -10,7 +10,7 @@ from s4a.schema import unit_of
 from s4a.show.browser import color_bytes
 from s4a.show.surfaces import mode_arrays, mode_limits, score_state
 from s4a.widgets.modes import ModesView
-from s4a.widgets.panel import Panel, checkbox, dropdown, row, unbroken_row
+from s4a.widgets.panel import Panel, checkbox, dropdown, row
 from s4a_morphometrics.poses import LEVELS, structures, structures_modes
 
 LABELS = {
@@ -20,6 +20,12 @@ LABELS = {
 }
 COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
 N_MODES = 6
+
+
+def unbroken_row(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
+    """Return a row of widgets that does not wrap."""
+    layout = {"align_items": "center", "flex": "none", "margin": "0 1em 0 0"}
+    return ipywidgets.HBox(widgets, layout=layout)
 
 
 class Structures(Panel):

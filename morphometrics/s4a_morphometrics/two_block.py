@@ -14,9 +14,9 @@ import xarray as xr
 
 from s4a.analysis.effects import modes_study
 from s4a.analysis.inputs import Values, registration_of
-from s4a.analysis.permutation import check_count, design, p_values
+from s4a.analysis.permutation import check_permutations, design, p_values
 from s4a.method.pca import gram, principal_components
-from s4a.schema import FIELD_UNIT, dataset, in_unit, unit_of
+from s4a.schema import FIELD_UNIT, check_count, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 from s4a_morphometrics.fields import field_sample
 
@@ -175,7 +175,7 @@ def covariation(
     (True, ('component', 'vertex'))
     """
     seed = seed_of(seed, rng)
-    check_count(n_permutations)
+    check_permutations(n_permutations)
     no_values = np.zeros(registration_of(study).sizes["shape"])
     blocks = field_sample(study, field, no_values, "", covariates)
     sample = blocks.sample
@@ -183,8 +183,7 @@ def covariation(
     pls = two_block(A, B, covariates=sample.Z, n_permutations=n_permutations, seed=seed)
     most = len(pls["singular"])
     c = min(most, 10) if n_components is None else n_components
-    if not 1 <= c <= most:
-        raise ValueError(f"n_components needs a number from 1 to {most}, found {c}")
+    check_count("n_components", c, 1, most)
     n = len(A)
     Z = basis_of(sample.Z, n)
     scores, deviations, axes = [], [], []

@@ -287,7 +287,7 @@ def test_untestable_studies_are_errors(partners):
     study = study_of(fields(7, 6))
     with pytest.raises(ValueError, match="both subject and side"):
         asymmetry(study, subject="subject")
-    with pytest.raises(ValueError, match="of must be 'vector' or 'normal'"):
+    with pytest.raises(ValueError, match="of must be one of 'vector', 'normal'"):
         asymmetry(study, of="size")
     with pytest.raises(ValueError, match="use 4 shapes, fewer"):
         Model.one_sample(3).vertex_test(np.ones((3, 5, 3)))

@@ -112,7 +112,7 @@ def test_a_field_that_does_not_fit_is_refused_by_shape(study, caplog):
     meshes = study["original"].children
     good = {name: np.arange(mesh.sizes["vertex"]) * 1.0 for name, mesh in meshes.items()}
     first, second, *_ = good
-    with pytest.raises(ValueError, match=f"of {first} needs a number for each of the .*vertices"):
+    with pytest.raises(ValueError, match=f"of {first} needs a value for each of the .*vertices"):
         with_field(study, "f", good | {first: np.ones(7)})
     with pytest.raises(ValueError, match=f"lacks {second}: give them, or partial=True"):
         with_field(study, "f", {name: good[name] for name in good if name != second})

@@ -178,7 +178,7 @@ def test_single_visits_are_refused_or_reported(simulated, caplog):
         growth(simulated, "age", ["a", "b"], **options)
     with pytest.raises(ValueError, match="combination of the covariates"):
         growth(simulated, "age", "person", covariates={"years": AGE * 2}, **options)
-    with pytest.raises(ValueError, match="of must be 'vector' or 'normal'"):
+    with pytest.raises(ValueError, match="of must be one of 'vector', 'normal'"):
         growth(simulated, "age", "person", of="x", **options)
     caplog.clear()
     alone = np.where(np.arange(24) == 23, "alone", person)

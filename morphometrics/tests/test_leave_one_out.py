@@ -59,11 +59,11 @@ def test_without_its_template_a_study_is_registered_to_the_next(study):
 
 
 def test_flagged_shapes_are_left_out_or_included_on_demand():
-    tree = synthetic.brains(5, 600, seed=2)["original"]
+    tree, small = synthetic.brains(5, 300, seed=2)["original"], OPTIONS | {"n_coarse": 150}
     good = {name: as_arrays(node.to_dataset()) for name, node in tree.children.items()}
     X, T = good["brain_01"]
-    study = analyse(good | {"a_metre": (X / 1000, T)}, **OPTIONS)
-    found, alone = (generalization(one, n_points=0) for one in (study, analyse(good, **OPTIONS)))
+    study = analyse(good | {"a_metre": (X / 1000, T)}, **small)
+    found, alone = (generalization(one, n_points=0) for one in (study, analyse(good, **small)))
     assert found.identical(alone)
     kept = statistics.with_flagged(study)
     assert generalization(kept, n_points=0).attrs["shapes"] == 6

@@ -26,7 +26,7 @@ from s4a.analysis.permutation import (
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import gram, principal_components
-from s4a.schema import check_type, dataset, in_unit, unit_of
+from s4a.schema import Array, check_choice, check_type, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
 log = logging.getLogger(__name__)
@@ -334,7 +334,7 @@ def regress(
     )
 
 
-def freed_deviation(x: np.ndarray, Z: np.ndarray | None) -> float:
+def freed_deviation(x: Array, Z: Array | None) -> float:
     """Return the standard deviation of a variable ``(s,)`` adjusted for covariates ``(s, c)``."""
     if Z is None:
         return float(x.std(ddof=1))
@@ -344,7 +344,7 @@ def freed_deviation(x: np.ndarray, Z: np.ndarray | None) -> float:
     return float(np.sqrt(residual @ residual / (len(x) - 1)))
 
 
-def numbers_of(values: np.ndarray, what: str = "variable") -> np.ndarray:
+def numbers_of(values: Array, what: str = "variable") -> Array:
     """Return the variable of a regression as floats ``(s,)`` after a check."""
     if values.dtype.kind == "U":
         raise ValueError(
@@ -475,9 +475,9 @@ def modes_study(
     shapes: xr.DataArray,
     *,
     name: str,
-    deformation: np.ndarray,
-    mean: np.ndarray | None = None,
-    **modes: np.ndarray,
+    deformation: Array,
+    mean: Array | None = None,
+    **modes: Array,
 ) -> xr.DataTree:
     """Return a study of some shapes with given modes in ``/pca``, to show them.
 
@@ -526,7 +526,7 @@ def check_moves(fit: xr.Dataset) -> None:
         )
 
 
-def scores_of(sample: Sample, n_components: int | None) -> tuple[np.ndarray, np.ndarray]:
+def scores_of(sample: Sample, n_components: int | None) -> tuple[Array, Array]:
     """Return standardised scores ``(s, c)``, and all scores in the unit of the input."""
     d = sample.d
     variance, V = principal_components(gram(d - d.mean(0), sample.area))
@@ -569,16 +569,15 @@ def _report_unequal_variances(coordinates, x, sample):
     )
 
 
-def fields_to_test(d: np.ndarray, registration: xr.Dataset, of: str) -> np.ndarray:
+def fields_to_test(d: Array, registration: xr.Dataset, of: str) -> Array:
     """Return the fields ``(s, n, k)`` of a test at every vertex: vectors or normal components."""
-    if of not in ("vector", "normal"):
-        raise ValueError(f"of must be 'vector' or 'normal'; found {of!r}")
+    check_choice("of", of, ("vector", "normal"))
     if of == "vector":
         return d
     return normal_displacement(d, vertex_normals(*as_arrays(registration)))[..., None]
 
 
-def vertex_results(test: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
+def vertex_results(test: tuple[Array, Array, Array]) -> dict[str, Array]:
     """Return the variables of a test at every vertex by name."""
     share, p, p_max = test
     return {
@@ -603,6 +602,6 @@ def _test_vertices(sample, model, of):
     return in_unit(result, sample.unit)
 
 
-def squared_cohen_f(share: np.ndarray) -> np.ndarray:
+def squared_cohen_f(share: Array) -> Array:
     """Return Cohen's f^2 at every vertex ``(n,)``: explained over unexplained variance."""
     return share / np.maximum(1 - share, 1e-12)

@@ -1,6 +1,5 @@
 """Export of registered collections to other programs (4.3, 6.1, 6.2): meshes and tables."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,15 +21,11 @@ from s4a.input.coordinates import (
     turned,
 )
 from s4a.input.files import write_mesh
+from s4a.input.raw import new_folder
+from s4a.schema import Array, check_choice
 from s4a.study import store
 
 FORMATS = {"ply": ".ply", "vtk": ".vtk", "obj": ".obj", "npz": ".npz", "gifti": ".gii"}
-
-
-def write_table(path: Path, head: Iterable[Any], rows: Iterable[Any]) -> Path:
-    """Write a CSV file and return its path."""
-    write_rows(path, [head, *rows])
-    return path
 
 
 def write_dataset(data: xr.Dataset | xr.DataTree, path: Path) -> Path:
@@ -43,7 +38,7 @@ def write_scores(pca: xr.Dataset, path: Path) -> Path:
     """Write scores to a CSV file, a row per shape, in standard deviations; return its path."""
     columns = (f"component_{c + 1}" for c in range(pca.sizes["component"]))
     rows = zip(pca["shape"].values.tolist(), pca["score"].values.tolist(), strict=True)
-    return write_table(path, ["shape", *columns], ([name, *row] for name, row in rows))
+    return write_rows(path, [["shape", *columns], *([name, *row] for name, row in rows)])
 
 
 def write_registered(
@@ -102,11 +97,8 @@ def write_registered(
     >>> [path.name for path in s4a.write_registered(study, folder)][5:8]
     ['brain_06.ply', 'template.ply', 'scores.csv']
     """
-    if format not in FORMATS or frame not in ("template", "shape"):
-        raise ValueError(
-            f"format must be one of {', '.join(FORMATS)}, frame template or shape; found "
-            f"{format!r}, {frame!r}"
-        )
+    check_choice("format", format, FORMATS)
+    check_choice("frame", frame, ("template", "shape"))
     registration = registration_of(study)
     names = registration["shape"].values.tolist()
     if "template" in names:
@@ -118,8 +110,7 @@ def write_registered(
             "frame='shape' needs the transform of every shape; this study has none: use "
             "frame='template'"
         )
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = new_folder(folder)
     suffix = FORMATS[format]
     X, T = as_arrays(registration)
     paths, aligned = [], system_of_template(study, registration.attrs.get("template", ""))
@@ -131,9 +122,7 @@ def write_registered(
             points = moved(image_in_shape(X, registered), M)
             triangles = turned(T, M)
         has_scalars = format != "obj" and "confidence" in registered
-        scalars: dict[str, Any] = {}
-        if has_scalars:
-            scalars["confidence"] = registered["confidence"].values
+        scalars: Any = {"confidence": registered["confidence"].values} if has_scalars else {}
         paths.append(folder / f"{name}{suffix}")
         write_mesh(paths[-1], points, triangles, **system.attrs, **scalars)
     paths.append(folder / f"template{suffix}")
@@ -145,14 +134,13 @@ def write_registered(
 
 def system_of_template(study: xr.DataTree, name: str) -> CoordinateSystem:
     """Return the axes and unit of shapes that are aligned to the template, without c_ras."""
-    meshes = study["original"].children if "original" in study.children else {}
-    system = CoordinateSystem.of(meshes[name].attrs if name in meshes else {})
+    system = CoordinateSystem.of(_attrs_of(study, name))
     return replace(system, origin=UNKNOWN if system.axes else "", to_scanner=None)
 
 
 def map_to_scan(
     study: xr.DataTree, name: str, given: CoordinateSystem | None = None, unit: str = ""
-) -> tuple[np.ndarray, CoordinateSystem]:
+) -> tuple[Array, CoordinateSystem]:
     """Return the map (4, 4) of a shape to its file, or to scanner RAS, and that system.
 
     Parameters
@@ -164,22 +152,20 @@ def map_to_scan(
     unit : str
         Unit to convert to, if that of the file is known.
     """
-    meshes = study["original"].children if "original" in study.children else {}
-    attrs = meshes[name].attrs if name in meshes else {"reflected": is_reflected(study, name)}
+    attrs = _attrs_of(study, name)
     system = file_system(attrs).filled(given or CoordinateSystem())
     written = system.in_world(unit=unit)
     return map_between(system, written, name) @ map_to_file(attrs), written
 
 
-def is_reflected(study: xr.DataTree, name: str) -> bool:
-    """Return whether the run mirrored a shape."""
+def _attrs_of(study, name):
+    """Attributes of a mesh; of a study without meshes, whether the run mirrored the shape."""
     if "original" in study.children:
         meshes = study["original"].children
-        return name in meshes and bool(meshes[name].attrs.get("reflected"))
+        return meshes[name].attrs if name in meshes else {}
     report = study["report"].to_dataset() if "report" in study.children else xr.Dataset()
-    if "reflected" not in report:  # as in restricted studies
-        return False
-    return bool(report["reflected"].sel(shape=name))
+    is_known = "reflected" in report and name in report["shape"]  # not in restricted studies
+    return {"reflected": bool(report["reflected"].sel(shape=name))} if is_known else {}
 
 
 def _write_modes(pca, folder, n_modes):
@@ -187,17 +173,14 @@ def _write_modes(pca, folder, n_modes):
     components = range(1, pca.sizes["component"] + 1)
     measures = ["standard_deviation", "explained_variance_ratio"]
     columns = (pca[name].values.tolist() for name in measures)
+    rows = zip(components, *columns, strict=True)
     paths = [
         write_scores(pca, folder / "scores.csv"),
-        write_table(
-            folder / "components.csv",
-            ["component", *measures],
-            zip(components, *columns, strict=True),
-        ),
+        write_rows(folder / "components.csv", [["component", *measures], *rows]),
     ]
     for c in components[:n_modes]:
         mode = pca["deformation"].values[c - 1].tolist()
-        paths.append(write_table(folder / f"mode_{c}.csv", "xyz", mode))
+        paths.append(write_rows(folder / f"mode_{c}.csv", ["xyz", *mode]))
     return [*paths, write_dataset(pca.load(), folder / "modes.nc")]
 
 
@@ -227,8 +210,7 @@ def write_results(result: xr.Dataset, folder: Path | str, name: str) -> list[Pat
     >>> [path.name for path in paths], paths[2].read_text().split()
     (['test.nc', 'test.csv', 'test.shape.csv'], ['shape,outlier', '0,True', '1,False'])
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = new_folder(folder)
     paths = [write_dataset(result, folder / f"{name}.nc")]
     tables = {}  # dims -> columns
     for variable, values in result.data_vars.items():
@@ -238,9 +220,8 @@ def write_results(result: xr.Dataset, folder: Path | str, name: str) -> list[Pat
         rows = zip(*columns.values(), strict=True)
         if dims:
             rows = zip(_index_of(result, dims[0]), *columns.values(), strict=True)
-        paths.append(
-            write_table(folder / f"{'.'.join([name, *dims])}.csv", [*dims, *columns], rows)
-        )
+        file = folder / f"{'.'.join([name, *dims])}.csv"
+        paths.append(write_rows(file, [[*dims, *columns], *rows]))
     return paths
 
 

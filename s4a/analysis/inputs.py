@@ -22,15 +22,16 @@ from s4a.input.subjects import (
 )
 from s4a.method.pca import pca_without
 from s4a.options import Options, kept_options, with_options
-from s4a.schema import check_type, require, unit_of
+from s4a.schema import Array, check_type, require, unit_of
 from s4a.study.tree import left_out
 
 log = logging.getLogger(__name__)
 
 # One value per shape: in the order of the study; by name of the shape in a dict, a pandas object or
 # a DataArray with the coordinate shape; or the name of a column of /subjects.
-Values = np.ndarray | Sequence[Any] | dict[str, Any] | str
+Values = Array | Sequence[Any] | dict[str, Any] | str
 
+KINDS = {"M": "dates", "m": "durations", "O": "a mixture", "c": "complex numbers"}
 DATE = re.compile(r"\d{4}-\d\d?-\d\d?.*|\d{4}/\d\d?/\d\d?|\d\d?[./-]\d\d?[./-](\d\d){1,2}")
 IDENTIFIER = re.compile(r"(\b|_)(id|nr|code)'?$", re.IGNORECASE)  # end of a column's name
 
@@ -44,10 +45,10 @@ class Sample(NamedTuple):
     """
 
     registration: xr.Dataset
-    d: np.ndarray
-    area: np.ndarray
-    values: np.ndarray
-    Z: np.ndarray | None
+    d: Array
+    area: Array
+    values: Array
+    Z: Array | None
     attributes: dict[str, str]
     unit: str
 
@@ -57,7 +58,7 @@ def sample_of(
     values: Values,
     what: str,
     covariates: Values | dict[str, Values] | list[str] | None = None,
-    needed: dict[str, np.ndarray] | None = None,
+    needed: dict[str, Array] | None = None,
 ) -> Sample:
     """Return the data of the shapes with all values; others are excluded, with a warning.
 
@@ -176,7 +177,7 @@ def with_flagged(study: xr.DataTree) -> xr.DataTree:
     return xr.DataTree.from_dict(nodes, name=study.name)
 
 
-def displacements_of(study: xr.DataTree) -> tuple[xr.Dataset, np.ndarray, np.ndarray]:
+def displacements_of(study: xr.DataTree) -> tuple[xr.Dataset, Array, Array]:
     """Return registration, displacements ``(s, n, 3)``, and vertex areas of sum 1 ``(n,)``.
 
     Flagged shapes are excluded, with a warning.
@@ -209,7 +210,7 @@ def displacements_of(study: xr.DataTree) -> tuple[xr.Dataset, np.ndarray, np.nda
     return registration, d, area / area.sum()
 
 
-def values_of(study: xr.DataTree, values: Values, what: str) -> np.ndarray:
+def values_of(study: xr.DataTree, values: Values, what: str) -> Array:
     """Return one value or row per shape in the order of the study; errors call them `what`.
 
     Returns
@@ -230,16 +231,6 @@ def values_of(study: xr.DataTree, values: Values, what: str) -> np.ndarray:
             f"{what} needs one value for each of {len(names)} shapes; found shape {values.shape}"
         )
     return _plain(values, names, what)
-
-
-def labels_of(study: xr.DataTree, values: Values, what: str) -> list[str]:
-    """Return a subject, side or other label of each shape as text, empty if it is missing."""
-    names = registration_of(study)["shape"].values.tolist()
-    found = values_of(study, values, what)
-    present = ~lacks_value(found)
-    kept = [name for name, one in zip(names, present, strict=True) if one]
-    check_column(found[present], kept, what, categories=True)
-    return [str(x) if one else "" for x, one in zip(found.tolist(), present, strict=True)]
 
 
 def _in_order(values, names, what):
@@ -274,7 +265,8 @@ def _in_order(values, names, what):
 def _plain(values, names, what):
     """Convert values to numbers, finite or NaN, or text."""
     if values.dtype.kind == "O":
-        missing = np.array([_is_none(value) for value in values.ravel()]).reshape(values.shape)
+        marks = [x is None or str(x) == "NaT" or is_missing(str(x)) for x in values.ravel()]
+        missing = np.reshape(np.array(marks, bool), values.shape)
         kinds = {np.asarray(value).dtype.kind for value in values[~missing].tolist()}
         if kinds <= set("iufb"):
             values = np.where(missing, np.nan, values).astype(float)
@@ -282,8 +274,9 @@ def _plain(values, names, what):
             values = np.where(missing, "", values).astype(str)
     if values.dtype.kind not in "iufbUS":
         raise ValueError(
-            f"{what} needs only numbers or only text; found {_kind(values)}: give a date as a "
-            "number, such as years since the first"
+            f"{what} needs only numbers or only text; found "
+            f"{KINDS.get(values.dtype.kind, values.dtype)}: give a date as a number, such as years "
+            "since the first"
         )
     if values.dtype.kind in "US":
         cells = [cell.strip() for cell in values.astype(str).ravel().tolist()]
@@ -302,17 +295,6 @@ def _plain(values, names, what):
     return values
 
 
-def _is_none(value):
-    """Whether an object is a missing value: None, NaN, NA of pandas, or text."""
-    return value is None or str(value) in ("nan", "<NA>", "NaT") or is_missing(str(value))
-
-
-def _kind(values):
-    return {"M": "dates", "m": "durations", "O": "a mixture", "c": "complex numbers"}.get(
-        values.dtype.kind, str(values.dtype)
-    )
-
-
 def _column(study, name, what):
     """Return a column of ``/subjects`` by shape; the value of a shape without a row is missing."""
     table = study["subjects"].to_dataset() if "subjects" in study.children else xr.Dataset()
@@ -326,13 +308,13 @@ def _column(study, name, what):
     return {shape: rows.get(shape) for shape in all_registered(study)["shape"].values.tolist()}
 
 
-def lacks_value(values: np.ndarray) -> np.ndarray:
+def lacks_value(values: Array) -> Array:
     """Return a mask of the shapes ``(s,)`` with a missing value."""
     missing = values == "" if values.dtype.kind == "U" else np.isnan(values.astype(float))
     return missing.reshape(len(values), -1).any(axis=1)
 
 
-def group_sizes(group: np.ndarray) -> str:
+def group_sizes(group: Array) -> str:
     """Return the sizes of groups in words, with a warning for groups under 10 shapes.
 
     Raises ValueError if there is only one group, or one has fewer than 3 shapes.
@@ -355,7 +337,7 @@ def group_sizes(group: np.ndarray) -> str:
 
 def covariates_of(
     study: xr.DataTree, covariates: Values | dict[str, Values] | list[str] | None
-) -> dict[str, np.ndarray]:
+) -> dict[str, Array]:
     """Return the covariates by name, with values ``(shape,)`` or ``(shape, c)``."""
     if covariates is None:
         return {}
@@ -376,7 +358,7 @@ def covariates_of(
     return columns
 
 
-def columns_of(covariates: dict[str, np.ndarray]) -> tuple[np.ndarray | None, str]:
+def columns_of(covariates: dict[str, Array]) -> tuple[Array | None, str]:
     """Return covariates as columns of numbers ``(s, c)``, text as indicators, and in words.
 
     Warns about columns that are constant, nearly a combination of others, or number the shapes.
@@ -422,7 +404,7 @@ def columns_of(covariates: dict[str, np.ndarray]) -> tuple[np.ndarray | None, st
     return Z, ", ".join(words)
 
 
-def numbers_shapes(name: str, values: np.ndarray) -> bool:
+def numbers_shapes(name: str, values: Array) -> bool:
     """Return whether a column seems to number the shapes.
 
     Its integers are distinct, and consecutive or called identifiers.
@@ -455,7 +437,7 @@ def _indicators_of(values, name):
     return groups.tolist(), numbers
 
 
-def redundant(Z: np.ndarray, names: list[str], terms: ArrayLike | None = None) -> list[str]:
+def redundant(Z: Array, names: list[str], terms: ArrayLike | None = None) -> list[str]:
     """List the columns ``(s, c)`` that are constant or combinations of earlier ones, in words.
 
     Columns of one term ``(c,)``, such as indicators of the same groups, may be correlated.

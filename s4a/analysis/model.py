@@ -10,23 +10,24 @@ as the attribute ``correspondence`` records.
 import numpy as np
 import xarray as xr
 from scipy import stats
+from scipy.linalg.lapack import dlasd4
 
 from s4a.analysis.inputs import displacements_of
-from s4a.analysis.permutation import check_count
+from s4a.analysis.permutation import check_permutations
 from s4a.geometry.closest import distance_to_surface
 from s4a.geometry.mesh import as_arrays
 from s4a.method.deform import smoother
 from s4a.method.pca import center_gram, gram, principal_components, synthesize
 from s4a.method.shape import Shape
-from s4a.schema import check_type, dataset, in_unit, unit_of
+from s4a.schema import Array, check_count, check_type, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
 KEPT = "kept from the whole collection: optimistic"
 
 
 def describe_by_others(
-    inner: np.ndarray, cross: np.ndarray, squared_norm: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    inner: Array, cross: Array, squared_norm: float
+) -> tuple[Array, Array, Array]:
     """Reconstruct a field by the model of other fields.
 
     Parameters
@@ -65,7 +66,7 @@ def describe_by_others(
     )
 
 
-def leave_one_out(K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def leave_one_out(K: Array) -> tuple[Array, Array]:
     """Reconstruct every field by the model of all others, see :func:`describe_by_others`.
 
     The scatter of the others is a rank-one downdate of that of all, S - s / (s - 1) x x^T with the
@@ -103,7 +104,7 @@ def leave_one_out(K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return error, score
 
 
-def downdate(d: np.ndarray, z: np.ndarray, rho: float) -> tuple[np.ndarray, np.ndarray]:
+def downdate(d: Array, z: Array, rho: float) -> tuple[Array, Array]:
     """Return the eigenvalues of diag(d) - rho z z^T, and |rho z| along each eigenvector.
 
     Parameters
@@ -137,73 +138,19 @@ def downdate(d: np.ndarray, z: np.ndarray, rho: float) -> tuple[np.ndarray, np.n
     changes = np.sqrt(w * w.sum()) > least
     eigenvalue, along = d.copy(), np.zeros(len(d))
     if changes.any():
-        eigenvalue[changes], slope = secular_roots(d[changes], w[changes])
-        along[changes] = np.sqrt(rho / slope)
+        w, far = w[changes], np.sqrt(d[changes][0] - d[changes])
+        size = w.sum()
+        # LAPACK has the eigenvalues root^2 of far^2 + size z z^T; difference is far - root
+        found = (dlasd4(j, far, np.sqrt(w / size), size) for j in range(len(far)))
+        difference, root, total, _ = map(np.array, zip(*found, strict=True))
+        gap = difference * total if len(far) > 1 else -size
+        eigenvalue[changes] = d[changes][0] - root**2
+        along[changes] = np.sqrt(rho / (w / gap**2).sum(-1))
     order = np.argsort(-eigenvalue, kind="stable")
     return eigenvalue[order], along[order]
 
 
-def secular_roots(d: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the roots of the secular equation f(x) = sum_j w_j / (d_j - x) - 1, and slopes of f.
-
-    There is one root between consecutive d_k, and the last is above 0.  All are iterated together,
-    relative to the nearer pole, with the rational approximation c + a / (d_k - x) + b / (d_k+1 - x)
-    of Li (1994), and by bisection if that fails.
-
-    Parameters
-    ----------
-    d : float ndarray (c,)
-        Distinct, positive, descending.
-    w : float ndarray (c,)
-        Positive.
-
-    Returns
-    -------
-    root, slope : float ndarray (c,)
-    """
-    eps = np.finfo(float).eps
-    under = np.append(d[1:], 0.0)
-    half = (d - under) / 2
-    is_high = 1 / (d - (under + half)[:, None]) @ w < 1  # the root is closer to d_k
-    origin = np.where(is_high, d, under)
-    x = np.where(is_high, -half, half)
-    low, high = np.minimum(x, 0), np.maximum(x, 0)
-    slope = np.zeros(len(d))
-    pole = np.where(is_high, w, np.append(w[1:], 0.0))  # weight of the nearer pole
-    todo = np.arange(len(d))
-    for step in range(200):
-        inverse = 1 / ((d - origin[todo, None]) - x[todo, None])  # (root, c)
-        f = inverse @ w - 1
-        magnitude = np.abs(inverse) @ w + 1
-        inverse *= inverse
-        slope[todo] = df = inverse @ w
-        low[todo] = np.where(f < 0, x[todo], low[todo])
-        high[todo] = np.where(f < 0, high[todo], x[todo])
-        width = high[todo] - low[todo]
-        is_open = width > 2 * eps * np.abs(x[todo]) + eps**2 * d[0]
-        is_open &= np.abs(f) > 4 * eps * magnitude
-        todo, f, df = todo[is_open], f[is_open], df[is_open]
-        if not len(todo):
-            return origin + x, slope
-        a, b = (end[todo] - origin[todo] - x[todo] for end in (d, under))
-        upper = is_high[todo]
-        # the nearer pole has its exact weight, that of the other matches the slope
-        near, other = np.where(upper, a, b), np.where(upper, b, a)
-        c = f - other * df - pole[todo] / near * (1 - other / near)
-        B = (a + b) * f - a * b * df
-        root = np.sqrt(np.abs(B**2 - 4 * a * b * f * c))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            change = np.where(B <= 0, (B - root) / (2 * c), 2 * a * b * f / (B + root))
-        new = x[todo] + change
-        middle = (low[todo] + high[todo]) / 2
-        inside = (new > low[todo]) & (new < high[todo]) & (step < 20)
-        x[todo] = np.where(inside, new, middle)
-    raise ArithmeticError(f"{len(todo)} of {len(d)} eigenvalues were not found")
-
-
-def specificity(
-    K: np.ndarray, n_samples: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def specificity(K: Array, n_samples: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
     """Return vertex distances of random shapes of the model to the nearest shape of the collection.
 
     Parameters
@@ -235,9 +182,7 @@ def specificity(
     return np.array(distance), np.array(nearest), score
 
 
-def variance_baseline(
-    features: np.ndarray, n_permutations: int, rng: np.random.Generator
-) -> np.ndarray:
+def variance_baseline(features: Array, n_permutations: int, rng: np.random.Generator) -> Array:
     """Return variance shares under the null hypothesis of independent features (Horn 1965).
 
     Every feature is permuted over the shapes.
@@ -263,17 +208,16 @@ def variance_baseline(
 
 
 def count_components(
-    variance: np.ndarray,
+    variance: Array,
     s: int,
     n_components: int | None,
     *,
     most: int,
-    share: float = 0.9,
     at_most: int | None = None,
 ) -> int:
     """Return the number of components of a test of s shapes; ValueError if it exceeds `most`.
 
-    By default the components of `share` of the variance, at most half of the shapes or `at_most`.
+    By default the components of 90 % of the variance, at most half of the shapes or `at_most`.
 
     Examples
     --------
@@ -284,23 +228,19 @@ def count_components(
     """
     if n_components is None:
         explained = np.cumsum(variance / variance.sum())
-        enough = int(np.searchsorted(explained, share - 1e-9)) + 1
+        enough = int(np.searchsorted(explained, 0.9 - 1e-9)) + 1
         limit = s // 2 if at_most is None else at_most
         n_components = max(1, min(enough, limit, len(variance), most))
-    c = int(n_components)
-    if not 1 <= c <= most:
-        raise ValueError(f"n_components needs a number from 1 to {most}; found {c}")
-    return c
+    check_count("n_components", n_components, 1, most)
+    return int(n_components)
 
 
-def mean_distance(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarray:
+def mean_distance(P: Array, X: Array, T: Array) -> Array:
     """Return the mean distance of points ``(..., p, 3)`` to a surface ``(...)``."""
     return distance_to_surface(P.reshape(-1, 3), X, T).reshape(P.shape[:-1]).mean(-1)
 
 
-def surface_error(
-    points: np.ndarray, steps: np.ndarray, X: np.ndarray, T: np.ndarray
-) -> np.ndarray:
+def surface_error(points: Array, steps: Array, X: Array, T: Array) -> Array:
     """Return mean distances of reconstructions of a left-out shape to its surface X, T.
 
     Parameters
@@ -321,7 +261,7 @@ def surface_error(
     return np.pad(mean_distance(P, X, T), (0, len(points) - len(P)), mode="edge")
 
 
-def draw_points(area: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+def draw_points(area: Array, n: int, rng: np.random.Generator) -> Array:
     """Draw vertices ``(n,)`` with probability by area (of sum 1), sorted."""
     return np.sort(rng.choice(len(area), min(n, len(area)), replace=False, p=area))
 
@@ -405,10 +345,10 @@ def evaluate(
     >>> bool(quality["generalization"][0] > quality["generalization"][3])
     True
     """
-    check_count(n_permutations)
-    check_count(n_samples, "n_samples", 2)
-    check_count(n_points, "n_points", 0)
-    check_count(n_surface, "n_surface", 2)
+    check_permutations(n_permutations)
+    check_count("n_samples", n_samples, 2)
+    check_count("n_points", n_points)
+    check_count("n_surface", n_surface, 2)
     registration, d, area = displacements_of(study)
     s = len(d)
     generator = np.random.default_rng(seed_of(seed, rng))
@@ -540,11 +480,10 @@ def sample(
     ('shape', 'component')
     """
     check_type(study, xr.DataTree)
-    check_count(n, "n", 0)
+    check_count("n", n)
     most = study["pca"].sizes["component"]
     c = most if n_components is None else n_components
-    if not 1 <= c <= most:
-        raise ValueError(f"n_components needs a number from 1 to {most}; found {c}")
+    check_count("n_components", c, 1, most)
     score = np.random.default_rng(seed_of(seed, rng)).normal(size=(n, c))
     names = [f"sample_{i + 1:0{len(str(n))}d}" for i in range(n)]
     meshes = {name: synthesize(study, row) for name, row in zip(names, score, strict=True)}

@@ -19,29 +19,27 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from s4a.schema import Array, check_choice, check_count
+
 log = logging.getLogger(__name__)
 
-MOST_PERMUTATIONS = 10_000_000
 # variance inflation factors from which covariates are reported, and a variable cannot be tested
 INFLATED, MOST_INFLATED = 10.0, 1e4
-VARIANCES = ("equal", "unequal")
 
 
-def check_count(n: int, name: str = "n_permutations", least: int = 1) -> None:
-    """Raise ValueError unless a number, of permutations by default, is in range."""
-    if not least <= n <= MOST_PERMUTATIONS:
-        raise ValueError(f"{name} needs a number from {least} to {MOST_PERMUTATIONS}; found {n}")
+def check_permutations(n_permutations: int) -> None:
+    """Raise ValueError unless a number of permutations is from 1 to 10 million."""
+    check_count("n_permutations", n_permutations, 1, 10_000_000)
 
 
 def check_options(n_permutations: int, variances: str, seed: int) -> dict[str, Any]:
     """Return the options of a :class:`Model` after a check."""
-    check_count(n_permutations)
-    if variances not in VARIANCES:
-        raise ValueError(f"variances must be 'equal' or 'unequal'; found {variances!r}")
+    check_permutations(n_permutations)
+    check_choice("variances", variances, ("equal", "unequal"))
     return {"n_permutations": n_permutations, "variances": variances, "seed": seed}
 
 
-def standardize(columns: np.ndarray) -> tuple[np.ndarray, float]:
+def standardize(columns: Array) -> tuple[Array, float]:
     """Centre columns ``(n, c)`` and scale them to length 1; return the rounding error, too.
 
     Columns that vary only by rounding are set to 0: the sum of ten times 0.1 is not always 1.
@@ -64,7 +62,7 @@ def standardize(columns: np.ndarray) -> tuple[np.ndarray, float]:
     return np.where(varies, columns / np.where(varies, length, 1), 0), rounding / least
 
 
-def design(x: np.ndarray, covariates: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def design(x: Array, covariates: Array | None = None) -> tuple[Array, Array]:
     """Return orthonormal bases of Z ``(n, r)`` and of the part of X orthogonal to Z ``(n, q)``.
 
     They do not depend on the unit or origin of a column.
@@ -106,7 +104,7 @@ def design(x: np.ndarray, covariates: np.ndarray | None = None) -> tuple[np.ndar
     return Z, Q
 
 
-def inflation(X: np.ndarray, Z: np.ndarray, n_parameters: int = 0) -> float:
+def inflation(X: Array, Z: Array, n_parameters: int = 0) -> float:
     """Return the variance inflation factor of columns, the largest one.
 
     Parameters
@@ -130,13 +128,13 @@ def inflation(X: np.ndarray, Z: np.ndarray, n_parameters: int = 0) -> float:
     return float((n - n_parameters) / n / max(share, 1e-30))
 
 
-def indicators(group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def indicators(group: Array) -> tuple[Array, Array]:
     """Return sorted names of groups, and indicator columns without the first ``(n, g - 1)``."""
     names, code = np.unique(group, return_inverse=True)
     return names, (code[:, None] == np.arange(1, len(names))).astype(float)
 
 
-def shrunk_covariance(R: np.ndarray) -> np.ndarray:
+def shrunk_covariance(R: Array) -> Array:
     """Return Ledoit-Wolf covariances ``(..., p, p)`` of centred samples ``(..., n, p)``.
 
     As :func:`sklearn.covariance.ledoit_wolf` (Ledoit & Wolf 2004), vectorised over samples.
@@ -162,7 +160,7 @@ def shrunk_covariance(R: np.ndarray) -> np.ndarray:
     return (1 - share) * S + share * size * np.eye(p)
 
 
-def hotelling(E: np.ndarray, Q: np.ndarray, dof: int) -> np.ndarray:
+def hotelling(E: Array, Q: Array, dof: int) -> Array:
     """Return Hotelling's T^2 ``(...,)``, the Lawley-Hotelling trace for several columns of X.
 
     Parameters
@@ -213,10 +211,10 @@ class Model:
     (19, [0, 1, 3, 2, 4, 5])
     """
 
-    x: np.ndarray
-    covariates: np.ndarray | None = None
+    x: Array
+    covariates: Array | None = None
     variances: str = "equal"
-    blocks: np.ndarray | None = None
+    blocks: Array | None = None
     n_permutations: int = 999
     seed: int = 0
     intercept: bool = True
@@ -228,7 +226,7 @@ class Model:
         return cls(ones, None, "unequal", None, n_permutations, seed, intercept=False)
 
     @cached_property
-    def bases(self) -> tuple[np.ndarray, np.ndarray]:
+    def bases(self) -> tuple[Array, Array]:
         """Orthonormal bases of Z and X, see :func:`design`."""
         if self.intercept:
             return design(self.x, self.covariates)
@@ -236,13 +234,13 @@ class Model:
         return np.empty((len(X), 0)), X / np.linalg.norm(X, axis=0)
 
     @property
-    def rows(self) -> np.ndarray:
+    def rows(self) -> Array:
         """Columns of x and covariates ``(n, q + c)``, a row per shape."""
         x = np.reshape(self.x, (len(self.x), -1))
         return x if self.covariates is None else np.column_stack([x, self.covariates])
 
     @property
-    def block_rows(self) -> list[np.ndarray]:
+    def block_rows(self) -> list[Array]:
         """Rows of each block of exchangeable shapes; one block by default."""
         if self.blocks is None:
             return [np.arange(len(self.x))]
@@ -314,7 +312,7 @@ class Model:
             "smallest_p": least,
         }
 
-    def rearrangements(self) -> tuple[Iterator[np.ndarray], int]:
+    def rearrangements(self) -> tuple[Iterator[Array], int]:
         """Return random permutations or sign flips, or all of them if there are few.
 
         Returns
@@ -337,25 +335,26 @@ class Model:
             drawn = (rng.permutation(n) for _ in itertools.count())
         return itertools.islice(drawn, self.n_permutations), self.n_permutations
 
-    def _code(self) -> np.ndarray:
+    def _code(self) -> Array:
         """Block number of each shape."""
         if self.blocks is None:
             return np.arange(len(self.x))
         return np.unique(self.blocks, return_inverse=True)[1]
 
-    def _all(self) -> Iterator[np.ndarray]:
+    def _all(self) -> Iterator[Array]:
         """All rearrangements, the identity first."""
         if self.variances == "unequal":
             code = self._code()
             signs = itertools.product([1.0, -1.0], repeat=int(code.max()))
             return (np.array([1.0, *row])[code] for row in signs)
-        if self.blocks is None:
-            return _all_orders(self.rows)
-        return _orders_within(self.rows, self.block_rows)
+        blocks = self.block_rows
+        orders = [[rows[order] for order in _all_orders(self.rows[rows])] for rows in blocks]
+        place = np.argsort(np.concatenate(blocks))
+        return (np.concatenate(chosen)[place] for chosen in itertools.product(*orders))
 
     def p_values(
-        self, statistic: Callable[[list[np.ndarray]], np.ndarray], least: Any, at_once: int
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, statistic: Callable[[list[Array]], Array], least: Any, at_once: int
+    ) -> tuple[Array, Array]:
         """Return p values by rearrangement of residuals; exact if all rearrangements are used.
 
         Parameters
@@ -377,7 +376,7 @@ class Model:
         others, n_others = self.rearrangements()
         return p_values(others, n_others, statistic, least, at_once)
 
-    def test(self, scores: np.ndarray) -> tuple[float, float]:
+    def test(self, scores: Array) -> tuple[float, float]:
         """Test scores ``(n, p)`` by Hotelling's T^2; return statistic and p value.
 
         Examples
@@ -401,9 +400,7 @@ class Model:
         p, _ = self.p_values(statistics_of, statistic * (1 - 1e-9), max(1, 1_000_000 // E.size))
         return statistic, float(p)
 
-    def vertex_test(
-        self, d: np.ndarray, floor: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def vertex_test(self, d: Array, floor: Array | None = None) -> tuple[Array, Array, Array]:
         """Test every vertex, with p values corrected for multiple comparisons (max-T).
 
         The statistic is Pillai's trace V, the explained share of the vectors' scatter; for one
@@ -471,12 +468,12 @@ class Model:
 
 
 def p_values(
-    others: Iterator[np.ndarray],
+    others: Iterator[Array],
     n_others: int,
-    statistic: Callable[[list[np.ndarray]], np.ndarray],
+    statistic: Callable[[list[Array]], Array],
     least: Any,
     at_once: int,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Array, Array]:
     """Return p values of given rearrangements, see :meth:`Model.p_values`."""
     count = np.zeros(np.shape(least), np.int64)
     largest = [np.empty(0, np.float32)]
@@ -492,15 +489,6 @@ def _count_orders(rows):
     """Number of distinct orders of rows."""
     counts = np.unique(rows, axis=0, return_counts=True)[1].tolist()
     return math.factorial(len(rows)) // math.prod(map(math.factorial, counts))
-
-
-def _orders_within(rows, block_rows):
-    """All orders that leave each shape in its block, the identity first."""
-    orders = [[block[order] for order in _all_orders(rows[block])] for block in block_rows]
-    for chosen in itertools.product(*orders):
-        order = np.empty(len(rows), int)
-        order[np.concatenate(block_rows)] = np.concatenate(chosen)
-        yield order
 
 
 def _drawn_within(blocks, rng):
@@ -532,7 +520,7 @@ def _all_orders(rows):
         yield order
 
 
-def rearranged(rows: np.ndarray, by: np.ndarray) -> np.ndarray:
+def rearranged(rows: Array, by: Array) -> Array:
     """Return rows ``(n, ...)`` in another order, or with other signs."""
     if by.dtype.kind == "i":
         return rows[by]
@@ -540,8 +528,8 @@ def rearranged(rows: np.ndarray, by: np.ndarray) -> np.ndarray:
 
 
 def scatter_test(
-    coordinates: np.ndarray, x: np.ndarray, *, covariates: np.ndarray | None = None
-) -> tuple[np.ndarray, float]:
+    coordinates: Array, x: Array, *, covariates: Array | None = None
+) -> tuple[Array, float]:
     """Test homogeneity of covariance by distances to the fitted values (Anderson 2006).
 
     A multivariate Levene test.
@@ -583,7 +571,7 @@ def scatter_test(
     return distance, float(stats.f.sf(explained / q / (unexplained / dof), q, dof))
 
 
-def whiten(E: np.ndarray) -> np.ndarray:
+def whiten(E: Array) -> Array:
     """Whiten residual vectors ``(n, v, d)`` by their scatter W at each vertex: W^-1/2 e, or 0."""
     value, V = np.linalg.eigh(np.einsum("nvd,nve->vde", E, E))  # (v, d), (v, d, d)
     largest = value[:, -1:]
@@ -598,7 +586,7 @@ def batched(items: Iterator[Any], size: int) -> Iterator[list[Any]]:
         yield batch
 
 
-def explained_share(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+def explained_share(A: Array, B: Array) -> Array:
     """Return Pillai's trace of permuted, whitened residuals: tr(B^T B (I - A^T A)^-1), ``(b, v)``.
 
     Parameters

@@ -29,9 +29,9 @@ from s4a.analysis.inputs import (
     with_flagged,
 )
 from s4a.analysis.model import KEPT, count_components, evaluate, leave_one_out, sample
-from s4a.analysis.permutation import Model, check_count, indicators
+from s4a.analysis.permutation import Model, check_permutations, indicators
 from s4a.method.pca import gram, principal_components
-from s4a.schema import dataset, in_unit, unit_of
+from s4a.schema import check_count, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
 
 if TYPE_CHECKING:
@@ -200,9 +200,7 @@ def classify(
     >>> classes["predicted"].sizes["shape"], classes.attrs["chance"]
     (6, 0.5)
     """
-    seed = seed_of(seed, rng)
-    check_count(n_permutations)
-    sample = sample_of(study, group, "group")
+    sample, seed = sample_of(study, group, "group"), seed_of(seed, rng)
     return classify_sample(sample, estimator, n_components, n_folds, n_permutations, seed)
 
 
@@ -224,8 +222,8 @@ def classify_sample(
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
-    if n_folds < 2:
-        raise ValueError(f"n_folds must be at least 2; found {n_folds}")
+    check_permutations(n_permutations)
+    check_count("n_folds", n_folds, 2)
     group, sizes = sample.values, group_sizes(sample.values)
     names, count = np.unique(group, return_counts=True)
     n_folds = min(n_folds, int(count.min()))

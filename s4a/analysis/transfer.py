@@ -35,13 +35,13 @@ from s4a.method.register import common_unit, identity, uncertainty
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
-from s4a.schema import dataset, in_unit, require
+from s4a.schema import Array, check_choice, check_rows, dataset, in_unit, require
 from s4a.study.pair import log_warning, match_both, shape_of
 
 BLURS = {None: 1.0, "fast": 1.0, "paper": 0.0}  # default of `blur` by preset
 
 # Triangles (p,) and barycentric weights (p, 3) of points on a surface, and their confidence (p,).
-Points = tuple[np.ndarray, np.ndarray, np.ndarray]
+Points = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -53,29 +53,29 @@ class Link:
     shape's vertices on the template.
     """
 
-    X: np.ndarray
-    T: np.ndarray
-    Y: np.ndarray
-    S: np.ndarray
-    image: np.ndarray
-    confidence: np.ndarray
-    triangle: np.ndarray
-    weights: np.ndarray
+    X: Array
+    T: Array
+    Y: Array
+    S: Array
+    image: Array
+    confidence: Array
+    triangle: Array
+    weights: Array
 
     @cached_property
-    def down(self) -> tuple[sp.csr_matrix, np.ndarray]:
+    def down(self) -> tuple[sp.csr_matrix, Array]:
         """Matrix ``(p, n)`` of values from template to shape, and confidence on the shape."""
         W = interpolation_matrix(self.T, self.triangle, self.weights, len(self.X))
         return W, W @ self.confidence
 
     @cached_property
-    def up(self) -> tuple[sp.csr_matrix, np.ndarray]:
+    def up(self) -> tuple[sp.csr_matrix, Array]:
         """Matrix ``(n, p)`` of values from shape to template, and confidence on the template."""
         normals = vertex_normals(self.image, self.T)
         triangle, weights = closest_facing_point(self.image, normals, self.Y, self.S)
         return interpolation_matrix(self.S, triangle, weights, len(self.Y)), self.confidence
 
-    def transfer_down(self, triangle: np.ndarray, weights: np.ndarray) -> Points:
+    def transfer_down(self, triangle: Array, weights: Array) -> Points:
         """Transfer points on the template to the shape."""
         points = (self.T, triangle, weights)
         P = interpolate(self.image, *points)
@@ -83,7 +83,7 @@ class Link:
         confidence = interpolate(self.confidence[:, None], *points)[:, 0]
         return *closest_facing_point(P, N, self.Y, self.S), confidence
 
-    def transfer_up(self, triangle: np.ndarray, weights: np.ndarray) -> Points:
+    def transfer_up(self, triangle: Array, weights: Array) -> Points:
         """Transfer points on the shape to the template."""
         P = interpolate(self.Y, self.S, triangle, weights)
         N = interpolate(vertex_normals(self.Y, self.S), self.S, triangle, weights)
@@ -95,7 +95,7 @@ class Link:
 Route = list[tuple[Link, str]]  # links with their directions, "down" or "up"
 
 
-def image_in_shape(X: np.ndarray, registered: xr.Dataset) -> np.ndarray:
+def image_in_shape(X: Array, registered: xr.Dataset) -> Array:
     """Return the registered template ``(n, 3)`` in the coordinates of the shape's file.
 
     `registered` is the shape's part of ``/registration``, with the alignment s R x + t.
@@ -112,7 +112,7 @@ def link(template: xr.Dataset, shape: xr.Dataset, registered: xr.Dataset) -> Lin
     return Link(X, T, Y, S, image_in_shape(X, registered), *(registered[n].values for n in names))
 
 
-def matrix_along(route: Route, n: int) -> tuple[sp.csr_matrix, np.ndarray]:
+def matrix_along(route: Route, n: int) -> tuple[sp.csr_matrix, Array]:
     """Return the matrix of a route from n vertices, and the confidence on the last mesh."""
     if not route:
         return sp.identity(n, format="csr"), np.ones(n)
@@ -124,7 +124,7 @@ def matrix_along(route: Route, n: int) -> tuple[sp.csr_matrix, np.ndarray]:
     return W, confidence
 
 
-def transfer_along(route: Route, triangle: np.ndarray, weights: np.ndarray) -> Points:
+def transfer_along(route: Route, triangle: Array, weights: Array) -> Points:
     """Transfer points from the first mesh of a route to the last."""
     confidence = np.ones(len(triangle))
     for step, direction in route:
@@ -134,7 +134,7 @@ def transfer_along(route: Route, triangle: np.ndarray, weights: np.ndarray) -> P
     return triangle, weights, confidence
 
 
-def blend_routes(routes: list[Route], n: int) -> tuple[sp.csr_matrix, np.ndarray]:
+def blend_routes(routes: list[Route], n: int) -> tuple[sp.csr_matrix, Array]:
     """Average routes, weighted by confidence: matrix ``(p, n)`` and mean confidence ``(p,)``."""
     matrices, confidences = zip(*(matrix_along(route, n) for route in routes), strict=True)
     weight = np.stack(confidences) + 1e-9  # (routes, p), no zero in the sum below
@@ -143,7 +143,7 @@ def blend_routes(routes: list[Route], n: int) -> tuple[sp.csr_matrix, np.ndarray
     return W.tocsr(), np.mean(confidences, axis=0)
 
 
-def votes_of(W: sp.csr_matrix, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def votes_of(W: sp.csr_matrix, label: Array) -> tuple[Array, Array]:
     """Return the votes of the source vertices for every label at every target vertex.
 
     Parameters
@@ -162,7 +162,7 @@ def votes_of(W: sp.csr_matrix, label: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return (W @ one_hot).toarray().astype(np.float32), value
 
 
-def diffuse_votes(vote: np.ndarray, X: np.ndarray, T: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def diffuse_votes(vote: Array, X: Array, T: Array, radius: Array) -> Array:
     """Diffuse votes by an implicit heat step, (A + W) v = A v0, over the uncertainty of the match.
 
     A are the vertex areas, W is the stiffness matrix times t = area radius^2 / 4.  In the plane the
@@ -196,7 +196,7 @@ def diffuse_votes(vote: np.ndarray, X: np.ndarray, T: np.ndarray, radius: np.nda
     return diffused
 
 
-def majority(vote: np.ndarray, value: np.ndarray) -> np.ndarray:
+def majority(vote: Array, value: Array) -> Array:
     """Return the label with most votes at every vertex; ties give the first in sorted order.
 
     Examples
@@ -269,92 +269,69 @@ def _routes_from_outside(
     return routes
 
 
-Targets = Iterator[tuple[str, xr.Dataset, list[Route]]]
-
-
 def plan(
     study: xr.DataTree,
+    given: Any,
     source: str | xr.Dataset | None,
     targets: list[str] | None,
     options: dict[str, Any] | None = None,
-) -> tuple[xr.Dataset, Targets]:
-    """Return the source mesh, and an iterator of (target name, mesh, routes to it).
+) -> tuple[list[tuple[xr.Dataset, Any]], Iterator[tuple[str, xr.Dataset, list[list[Route]]]]]:
+    """Return (mesh, values) of every source, and an iterator of (target, mesh, routes by source).
 
     Parameters
     ----------
     study, source, targets : see :func:`transfer_labels`
+    given : object or dict
+        Values of one `source`, or a dict of names of sources to their values.
     options : dict, optional
         Options of the match of an external source, which replace those of the study.
 
     Raises
     ------
     ValueError
-        If the study has no registration or lacks a shape, or options are given without an external
-        source.
+        If the study has no registration or lacks a shape, there is no source, or options are given
+        without an external source.
     """
-    registration = all_registered(study)
-    template = registration.attrs["template"]
-    names = registration["shape"].values.tolist()
-    source = template if source is None else source
-    external = isinstance(source, xr.Dataset)
-    targets = [n for n in names if external or n != source] if targets is None else list(targets)
-    needed = targets if external or source == template else [*targets, source]
-    unknown = [n for n in needed if n not in names]
-    if unknown:
-        raise ValueError(
-            f"no shape {', '.join(map(repr, unknown))} in the study; it has {', '.join(names)}"
-        )
-    if isinstance(source, xr.Dataset):
-        require(source, "position", "corner_vertex", what="source")
-        both = {"template": study["original"][template].to_dataset(), "source": source}
-        mesh = in_one_system(both)["source"]
-        up = _routes_from_outside(study, mesh, options or {})
-    elif options:
-        raise ValueError(
-            f"options {', '.join(options)} need an external source, which is matched to the "
-            f"template; found the shape {source!r}, which is registered: leave them out"
-        )
-    else:
-        mesh, up = study["original"][source].to_dataset(), _routes(study, source)[1]
-
-    def routes_to_targets():
-        for name in targets:
-            down, _ = _routes(study, name)
-            yield name, study["original"][name].to_dataset(), [a + b for a in up for b in down]
-
-    return mesh, routes_to_targets()
-
-
-def plan_several(
-    study: xr.DataTree,
-    given: Any,
-    source: str | xr.Dataset | None,
-    targets: list[str] | None,
-    options: dict[str, Any],
-) -> tuple[list[tuple[xr.Dataset, Any]], Iterator[tuple[str, xr.Dataset, list[list[Route]]]]]:
-    """Return (mesh, values) of every source, and an iterator of (target, mesh, routes by source).
-
-    `given` are the values of one `source`, or a dict of names of sources to their values.
-    """
-    several = isinstance(given, dict)
-    if several and (source is not None or not given):
+    if isinstance(given, dict) and (source is not None or not given):
         raise ValueError(
             f"a dict of sources to their values replaces source=; found {len(given)} sources and "
             f"source={source if isinstance(source, str) or source is None else 'a mesh'!r}"
         )
-    sources = list(given.items()) if several else [(source, given)]
-    if several and targets is None:
-        names = all_registered(study)["shape"].values.tolist()
-        targets = [name for name in names if name not in given]
-    plans = [plan(study, name, targets, options) for name, _ in sources]
+    registration = all_registered(study)
+    template, names = registration.attrs["template"], registration["shape"].values.tolist()
+    pairs = [*given.items()] if isinstance(given, dict) else [(source, given)]
+    pairs = [(template if one is None else one, values) for one, values in pairs]
+    inside = [one for one, _ in pairs if not isinstance(one, xr.Dataset)]
+    targets = [n for n in names if n not in inside] if targets is None else list(targets)
+    for name in targets:
+        check_choice("target", name, names)
+    for one in inside:
+        check_choice("source", one, [*names, template])
+    starts = [_start(study, one, options or {}) for one, _ in pairs]
 
     def routes_to_targets():
-        for steps in zip(*(steps for _, steps in plans), strict=True):
-            name, target, _ = steps[0]
-            yield name, target, [routes for *_, routes in steps]
+        for name in targets:
+            down, _ = _routes(study, name)
+            routes = [[a + b for a in up for b in down] for _, up in starts]
+            yield name, study["original"][name].to_dataset(), routes
 
-    meshes = [mesh for mesh, _ in plans]
-    return list(zip(meshes, (values for _, values in sources), strict=True)), routes_to_targets()
+    sources = [(mesh, values) for (mesh, _), (_, values) in zip(starts, pairs, strict=True)]
+    return sources, routes_to_targets()
+
+
+def _start(study, source, options):
+    """Mesh of a source, a shape or an external mesh, and its routes up to the template."""
+    if isinstance(source, xr.Dataset):
+        require(source, "position", "corner_vertex", what="source")
+        template = study["original"][study["registration"].attrs["template"]].to_dataset()
+        mesh = in_one_system({"template": template, "source": source})["source"]
+        return mesh, _routes_from_outside(study, mesh, options)
+    if options:
+        raise ValueError(
+            f"options {', '.join(options)} need an external source, which is matched to the "
+            f"template; found the shape {source!r}, which is registered: leave them out"
+        )
+    return study["original"][source].to_dataset(), _routes(study, source)[1]
 
 
 def transfer_labels(
@@ -448,9 +425,11 @@ def transfer_labels(
     """
     if blur is not None and not 0 <= blur <= 10:
         raise ValueError(f"blur needs a factor from 0 to 10; found {blur}")
-    sources, routes_to_targets = plan_several(study, label, source, targets, options)
+    sources, routes_to_targets = plan(study, label, source, targets, options)
     blur = BLURS[_preset(study, options)] if blur is None else blur
-    labels = [_per_vertex(values, mesh, "label") for mesh, values in sources]
+    labels = [
+        check_rows("labels of the source", one, (mesh.sizes["vertex"],)) for mesh, one in sources
+    ]
     transferred = {}
     for name, target, routes in routes_to_targets:
         blended = [blend_routes(r, len(one)) for r, one in zip(routes, labels, strict=True)]
@@ -476,7 +455,7 @@ def transfer_labels(
 
 def transfer_scalars(
     study: xr.DataTree,
-    field: np.ndarray,
+    field: Array,
     *,
     source: str | xr.Dataset | None = None,
     targets: list[str] | None = None,
@@ -517,16 +496,16 @@ def transfer_scalars(
     >>> bool(np.allclose(result["brain_02/field"], 1))
     True
     """
-    mesh, routes_to_targets = plan(study, source, targets, options)
-    field = _per_vertex(field, mesh, "field").astype(float)
+    [(mesh, _)], routes_to_targets = plan(study, None, source, targets, options)
+    field = check_rows("field of the source", field, (mesh.sizes["vertex"],)).astype(float)
     transferred = {}
-    for name, _, routes in routes_to_targets:
+    for name, _, [routes] in routes_to_targets:
         value, confidence = _blend_field(routes, field)
         transferred[name] = dataset(field=value, confidence=confidence.astype(np.float32))
     return xr.DataTree.from_dict(transferred)
 
 
-def on_template(study: xr.DataTree, name: str, field: np.ndarray) -> np.ndarray:
+def on_template(study: xr.DataTree, name: str, field: Array) -> Array:
     """Transfer a scalar field of a shape ``(vertex,)`` to the template.
 
     As :func:`transfer_scalars`; a field of the template is unchanged.
@@ -542,16 +521,6 @@ def _blend_field(routes, field):
     value = W @ np.nan_to_num(field) / np.maximum(weight, 1e-12)
     value[weight < 0.5] = np.nan
     return value, confidence
-
-
-def _per_vertex(values, mesh, what):
-    values = np.asarray(values)
-    if values.shape != (mesh.sizes["vertex"],):
-        raise ValueError(
-            f"{what} needs one value for each of the {mesh.sizes['vertex']} vertices of the "
-            f"source; found shape {values.shape}"
-        )
-    return values
 
 
 def transfer_landmarks(
@@ -634,7 +603,7 @@ def transfer_landmarks(
     >>> s4a.show.charts.surfaces(shown, colors)
     <TiledFigure ...>
     """
-    sources, routes_to_targets = plan_several(study, landmarks, source, targets, options)
+    sources, routes_to_targets = plan(study, landmarks, source, targets, options)
     marked = [_located(marks, mesh, farthest) for mesh, marks in sources]
     marked = [marked[0], *(_in_order_of(marked[0], one) for one in marked[1:])]
     named = marked[0][[name for name in NAMED if name in marked[0]]]
@@ -707,8 +676,7 @@ def correspondence(study: xr.DataTree, source: str, target: str) -> xr.Dataset:
     >>> found["image_position"].shape, bool((found["image_barycentric"].sum("corner") > 0.99).all())
     ((200, 3), True)
     """
-    mesh, routes_to_targets = plan(study, source, [target])
-    _, shape, routes = next(routes_to_targets)
+    [(mesh, _)], [(_, shape, [routes])] = plan(study, None, source, [target])
     vertices = identity(Shape(mesh))
     points = vertices["template_triangle"].values, vertices["template_barycentric"].values
     paths = [(points, route) for route in routes]

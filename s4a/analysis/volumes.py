@@ -16,6 +16,8 @@ from s4a.geometry.mesh import as_arrays
 from s4a.input.chirality import map_to_file
 from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved, turned
 from s4a.input.labels import read_grid, voxels_marked
+from s4a.input.raw import new_folder
+from s4a.schema import Array
 
 VOLUMES = ("NIfTI", "MGH", "NRRD")
 
@@ -24,7 +26,7 @@ def write_label_volumes(
     study: xr.DataTree,
     folder: Path | str,
     *,
-    label: np.ndarray | None = None,
+    label: Array | None = None,
     grid: Path | str | None = None,
     coordinate_system: str | None = None,
     unit: str | None = None,
@@ -97,12 +99,14 @@ def write_label_volumes(
     # before any file is written
     grids = {name: _grid_of(study, name, grid) for name in names}
     given = CoordinateSystem.of({"coordinate_system": coordinate_system, "unit": unit})
-    maps = {
-        name: _map_to(grids[name][0], study["original"][name].attrs, given, name) for name in names
-    }
+    maps = {}
+    for name, (volume, _) in grids.items():
+        attrs = study["original"][name].attrs
+        file, system = file_system(attrs).filled(given), read_grid(volume)[2]
+        what = f"{name}, to be written in {volume},"
+        maps[name] = map_between(file, system, what) @ map_to_file(attrs)
     transferred = transfer_labels(study, label, targets=names)
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = new_folder(folder)
     paths = []
     for name in names:
         mesh = study["original"][name].to_dataset()
@@ -128,13 +132,6 @@ def _grid_of(study, name, grid):
             "(--grid FILE)"
         )
     return attrs["path"], attrs["label"]
-
-
-def _map_to(grid, attrs, given, name):
-    """Map (4, 4) of a mesh, which the run may have mirrored or converted, to a volume."""
-    file = file_system(attrs).filled(given)
-    system = read_grid(grid)[2]
-    return map_between(file, system, f"{name}, to be written in {grid},") @ map_to_file(attrs)
 
 
 def _volume(mesh, M, name, label, grid, source_label):

@@ -54,13 +54,11 @@ TRANSFERRED = (
 )
 
 
-def table(
-    rows: Iterable[Sequence[Any]], head: Sequence[str], number: str = "g", width: int = 120
-) -> str:
+def table(rows: Iterable[Sequence[Any]], head: Sequence[str], number: str = "g") -> str:
     """Return rows of text as aligned columns.
 
     Numbers are aligned to the right, floats in the format `number`, NaN as "-"; the last column is
-    wrapped at `width` characters.
+    wrapped at 120 characters.
 
     Examples
     --------
@@ -80,7 +78,7 @@ def table(
     margin = sum(widths[:-1]) + 2 * (len(head) - 1)
     lines = []
     for *cells, long in rows:
-        first, *rest = wrapped(long, max(width - margin, 40)) or [""]
+        first, *rest = wrapped(long, max(120 - margin, 40)) or [""]
         layout = zip([*cells, first], widths, numeric, strict=True)
         lines.append("  ".join(c.rjust(w) if n else c.ljust(w) for c, w, n in layout).rstrip())
         lines += [" " * margin + line for line in rest]
@@ -524,12 +522,6 @@ def comparison_table(pairs: "xr.Dataset") -> str:
         ]
         rows.append([name, f"{method['block_seconds'].sum().item():.1f}", *cells])
     return table(rows, ["method", "CPU s", *(title for title, *_ in columns.values())])
-
-
-def block_table(methods: Sequence[str], blocks: Sequence[str], seconds: "np.ndarray") -> str:
-    """Return the CPU seconds (m, b) of every method by block (Fig. 3)."""
-    rows = [[method, *row, row.sum()] for method, row in zip(methods, seconds, strict=True)]
-    return table(rows, ["CPU s", *blocks, "all"], ".1f")
 
 
 def collection_table(result: "xr.Dataset") -> str:

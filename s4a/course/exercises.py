@@ -13,6 +13,7 @@ import numpy as np
 
 from s4a.analysis.transfer import transfer_scalars
 from s4a.datasets.synthetic import LABELS, position
+from s4a.evaluation.metrics import dice
 from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas
 from s4a.method.nearest import nearest_rows
 from s4a.method.spectral import project, reconstruct, unit_area
@@ -185,12 +186,6 @@ def _is_derangement(match, n):
     return moved and np.array_equal(np.unique(match), np.arange(n))
 
 
-def _dice(transferred, own, name):
-    """Return Dice's overlap of a region, by vertices."""
-    a, b = (labels == LABELS.index(name) for labels in (transferred, own))
-    return 2 * (a & b).sum() / (a.sum() + b.sum())
-
-
 def _cycle_error(Y, *cycle):
     """Return the cycle error of the maps through the latent space."""
     C = np.eye(Y.shape[1])
@@ -203,17 +198,6 @@ def _correlation_transferred(pair, field):
     """Return the correlation of a field that is transferred from left to right with its own."""
     transferred = transfer_scalars(pair, field.parts["left"], source="left")["right/field"]
     return np.corrcoef(np.asarray(transferred), field.parts["right"])[0, 1]
-
-
-def _directional_share(asymmetries):
-    """Return the share of directional asymmetry in the variance within individuals."""
-    _, sides, rest = asymmetries["sum_of_squares"].values
-    return sides / (sides + rest)
-
-
-def _displacement_by_age(fit, years):
-    """Return the largest displacement of a vertex over some years."""
-    return years * np.linalg.norm(fit["effect"].values, axis=1).max()
 
 
 # The right answer, or a function of the arguments that follow the answer in the cell.  It returns
@@ -266,7 +250,7 @@ EXERCISES: dict[str, Any] = {
         mean["seconds"].sel(algorithm="FMAP+ZO") / mean["seconds"].sel(algorithm="RE-MATCH")
     ).item(),
     "10.3": lambda n: lambda match: _is_derangement(match, n),
-    "11.1": lambda labels, target: _dice(labels, target["label"].values, "cerebellum left"),
+    "11.1": lambda labels, target: dice(labels, target["label"])[LABELS.index("cerebellum left")],
     "11.2": lambda labels, target: (
         np.bincount(labels, vertex_areas(*as_arrays(target)))[LABELS.index("occipital right")] / 100
     ),
@@ -278,7 +262,7 @@ EXERCISES: dict[str, Any] = {
     "12.2": lambda test: (
         np.mean(test["p_vertex"].values < 0.05) - np.mean(test["p_family_wise"].values < 0.05)
     ),
-    "12.3": lambda fit: _displacement_by_age(fit, 10),
+    "12.3": lambda fit: 10 * np.linalg.norm(fit["effect"].values, axis=1).max(),
     "13.1": lambda report: report["shape"].values[report["status"].values != "ok"].tolist(),
     "13.2": lambda image: (
         (np.asarray(image.dataobj) == 1).sum() * abs(np.linalg.det(image.affine)) / 1000
@@ -290,7 +274,7 @@ EXERCISES: dict[str, Any] = {
         *(v[confidence <= np.median(confidence)] for v in (field, own))
     )[0, 1],
     "15.1": 6,
-    "15.2": _directional_share,
+    "15.2": lambda a: a["sum_of_squares"].values[1] / a["sum_of_squares"].values[1:].sum(),
     "15.3": lambda asymmetries: asymmetries["fluctuating_size"].idxmax().item(),
     "16.1": lambda half, truth: np.linalg.norm(half["position"] - truth, axis=1)[
         half["present"].values == 1

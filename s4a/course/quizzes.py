@@ -7,6 +7,7 @@ next line.  A quiz is plain HTML: it works without a kernel, on a page and in a 
 
 import html
 import re
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
@@ -32,12 +33,12 @@ class Question(NamedTuple):
     answers: tuple[Answer, ...]
 
 
+@dataclass(repr=False)
 class Quiz:
     """Questions of a lesson; a click on an answer shows its explanation."""
 
-    def __init__(self, lesson: str, questions: list[Question]) -> None:
-        self.lesson = lesson
-        self.questions = questions
+    lesson: str
+    questions: list[Question]
 
     def __repr__(self) -> str:
         lines = []

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from joblib import delayed
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
@@ -23,9 +24,11 @@ from s4a.geometry.compiled import fpsample
 from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, vertex_areas
 from s4a.input.collection import read_shapes
 from s4a.input.files import write_mesh
-from s4a.schema import dataset, in_unit
+from s4a.input.raw import new_folder
+from s4a.schema import Array, check_choice, check_count, dataset, in_unit
 from s4a.seeds import RNG, seed_of
 from s4a.study.pipeline import analyse
+from s4a.study.processes import workers
 
 
 def _add_artefacts(X, T, u, rng):
@@ -174,23 +177,26 @@ def _step(x, width):
     return 0.5 * (1 + np.tanh(x / width))
 
 
-def _fold_noise(p, wavelength=30.0, waves=48):
+def _fold_noise(p):
     """Random field of one wavelength and unit variance, whose zeros are the sulci.
 
     The field is nearly mirror-symmetric in x.
     """
-    rng = np.random.default_rng(20)
+    rng, wavelength, waves = np.random.default_rng(20), 30.0, 48
     k = rng.normal(size=(waves, 3))
     k *= 2 * np.pi / wavelength / np.linalg.norm(k, axis=1, keepdims=True)
     phase = rng.uniform(0, 2 * np.pi, waves)
     tilt = rng.normal(0, 0.35, waves)  # without it the field would be symmetric
     total = np.zeros(len(p))
-    for (kx, ky, kz), a, b in zip(k, phase, tilt, strict=True):
-        total += np.cos(kx * p[:, 0] + b) * np.cos(ky * p[:, 1] + kz * p[:, 2] + a)
+    for start in range(0, len(p), 8192):  # 64 KB a column, which stay in the cache
+        part = total[start : start + 8192]
+        x, y, z = np.ascontiguousarray(p[start : start + 8192].T)
+        for (kx, ky, kz), a, b in zip(k, phase, tilt, strict=True):
+            part += np.cos(kx * x + b) * np.cos(ky * y + kz * z + a)
     return total * 2 / np.sqrt(waves)
 
 
-def reference_brain(u: ArrayLike) -> np.ndarray:
+def reference_brain(u: ArrayLike) -> Array:
     """Map points u (p, 3) of the unit sphere to the reference brain: (p, 3) in mm."""
     u = np.asarray(u, float)
     x, y, z = u.T
@@ -277,8 +283,7 @@ def _true_modes(n_modes):
     On the reference brain the modes are orthogonal to rigid transforms and to each other, by a
     Cholesky factor of the Gram matrix of the generators.
     """
-    if not 0 <= n_modes <= len(MODES):
-        raise ValueError(f"n_modes needs a number from 0 to {len(MODES)}, found {n_modes}")
+    check_count("n_modes", n_modes, 0, len(MODES))
     centre, width, rows = _generators(n_modes)
     u, T = _sphere(4000)
     x = reference_brain(u)
@@ -351,8 +356,7 @@ def simulate(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = 
     >>> truth["true_score"].std("shape").values.round(6).tolist()
     [1.0, 1.0, 1.0]
     """
-    if n < 1:
-        raise ValueError(f"n, the number of shapes, must be at least 1; found {n}")
+    check_count("n", n, 1)
     seed = seed_of(seed, rng)
     draw = np.random.default_rng([seed, 0])
     centre, width, translation, rotation = _true_modes(n_modes)
@@ -387,7 +391,7 @@ def simulate(n: int = 12, seed: int = 0, *, n_modes: int = 3, rng: RNG | None = 
     return truth.assign_coords(shape=[f"brain_{i + 1:0{max(2, len(str(n)))}d}" for i in range(n)])
 
 
-def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: ArrayLike) -> np.ndarray:
+def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: ArrayLike) -> Array:
     """Return the exact positions of reference points on a shape.
 
     Parameters
@@ -426,8 +430,7 @@ def position(truth: xr.Dataset | xr.DataTree, shape: str, reference_point: Array
 def _index(truth, shape):
     """Row of a shape in the ground truth."""
     names = truth["shape"].values.tolist()
-    if shape not in names:
-        raise ValueError(f"shape must be one of {', '.join(names)}; found {shape!r}")
+    check_choice("shape", shape, names)
     return names.index(shape)
 
 
@@ -463,24 +466,31 @@ def _sphere(n):
     return u, _delaunay(u)
 
 
-def _mesh(truth, shape, n_vertices, rng):
-    """Sample reference points by farthest points on the shape, and triangulate them."""
-    if n_vertices < 4:
-        raise ValueError(f"n_vertices must be at least 4 for a closed mesh; found {n_vertices}")
+def _clean_brain(truth, shape, n_vertices, rng):
+    """Return farthest-point samples of a shape, their triangles, and their reference points."""
+    check_count("n_vertices", n_vertices, 4)
     u = _fibonacci(5 * n_vertices) @ Rotation.random(random_state=rng).as_matrix().T
     u = _unit(u + rng.normal(0, 0.3 * np.sqrt(4 * np.pi / len(u)), u.shape))
-    x = position(truth, shape, u).astype(np.float32)
+    X = position(truth, shape, u)
+    x = X.astype(np.float32)
     start = int(rng.integers(len(u)))
     if fpsample:
         h = min(7, int(np.log2(len(u))))  # levels of the tree; no leaf may be empty
         sample = fpsample.bucket_fps_kdline_sampling(x, n_vertices, h=h, start_idx=start)
     else:
         sample = farthest_samples(x, n_vertices, start)
-    u = u[np.sort(sample)]
-    return u, _delaunay(u)
+    sample = np.sort(sample)
+    return X[sample], _delaunay(u[sample]), u[sample]
 
 
-def labels(reference_point: ArrayLike) -> np.ndarray:
+def _brain(truth, shape, n_vertices, seed, dirty):
+    """Return points, triangles and reference points of one shape of :func:`brains`."""
+    clean, artefacts = (np.random.default_rng([seed, i, _index(truth, shape)]) for i in (1, 2))
+    brain = _clean_brain(truth, shape, n_vertices, clean)
+    return _add_artefacts(*brain, artefacts) if dirty else brain
+
+
+def labels(reference_point: ArrayLike) -> Array:
     """Return labels of reference points: indices in :data:`LABELS`, 0 for NaN.
 
     Examples
@@ -510,42 +520,6 @@ def _annotate(mesh, truth, shape, reference_point):
     return in_unit(mesh.merge(annotations).assign_attrs(unit="mm", coordinate_system="RAS"), "mm")
 
 
-def _raw_brain(truth, shape, n_vertices=40_000, seed=0, *, rng=None):
-    """Return a brain with the artefacts of :func:`_add_artefacts`.
-
-    Parameters
-    ----------
-    truth, shape : as for :func:`position`
-    n_vertices : int
-        Without the artefacts.
-    seed : int
-        Seed of the random numbers.
-    rng : int or numpy.random.Generator, optional
-        Replaces `seed`, as in SPEC 7.
-
-    Returns
-    -------
-    points : float ndarray (p, 3)
-    triangles : int32 ndarray (m, 3)
-    reference_point : float ndarray (p, 3)
-        NaN in loose components and at unreferenced vertices.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import s4a
-    >>> from s4a.datasets.synthetic import _raw_brain
-    >>> truth = s4a.synthetic.simulate(2)
-    >>> points, triangles, reference_point = _raw_brain(truth, "brain_01", 500)
-    >>> len(points) > 500, bool(np.isnan(reference_point).any())
-    (True, True)
-    """
-    seed = seed_of(seed, rng)
-    i = _index(truth, shape)
-    u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
-    return _add_artefacts(position(truth, shape, u), T, u, np.random.default_rng([seed, 2, i]))
-
-
 def _reference_after_cleaning(mesh, raw, reference_point):
     """Reference points after cleaning; moved vertices get the mean of their neighbours."""
     X, T = as_arrays(mesh)
@@ -565,6 +539,7 @@ def brains(
     dirty: bool = False,
     n_modes: int = 3,
     rng: RNG | None = None,
+    n_jobs: int | None = None,
 ) -> xr.DataTree:
     """Simulate a population of brains with known modes and exact correspondences.
 
@@ -583,6 +558,8 @@ def brains(
         the meshes before cleaning.
     n_modes : int
         Number of simulated modes.
+    n_jobs : int, optional
+        As in joblib; the result does not depend on it.
 
     Returns
     -------
@@ -623,13 +600,10 @@ def brains(
     """
     seed = seed_of(seed, rng)
     truth = simulate(n, seed, n_modes=n_modes)
-    raw = {}
-    for i, shape in enumerate(truth["shape"].values.tolist()):
-        if dirty:
-            raw[shape] = _raw_brain(truth, shape, n_vertices, seed)
-        else:
-            u, T = _mesh(truth, shape, n_vertices, np.random.default_rng([seed, 1, i]))
-            raw[shape] = position(truth, shape, u), T, u
+    names = truth["shape"].values.tolist()
+    simulated = delayed(_brain)
+    meshes = workers(n_jobs)(simulated(truth, name, n_vertices, seed, dirty) for name in names)
+    raw = dict(zip(names, meshes, strict=True))
     shapes = read_shapes({shape: (X, T) for shape, (X, T, _) in raw.items()}, compare=False)
     nodes = {"/report": shapes["report"].to_dataset(), "/truth": truth}
     for shape, (X, T, u) in raw.items():
@@ -669,8 +643,7 @@ def write(tree: xr.DataTree, folder: Path | str) -> list[Path]:
     >>> [path.name for path in paths], (folder / "truth.nc").is_file()
     (['brain_01.ply', 'brain_02.ply'], True)
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = new_folder(folder)
     truth, paths = tree["truth"].to_dataset(), []
     nodes = {"/": truth}
     for shape in truth["shape"].values:

@@ -13,25 +13,30 @@ from s4a.geometry.align import align
 from s4a.geometry.mesh import as_arrays
 from s4a.method import fmap
 from s4a.method.initial_map import map_after_alignment, nearest_after_alignment
-from s4a.method.register import match_functions
+from s4a.method.nearest import nearest_of_few
 from s4a.method.shape import Shape
+from s4a.schema import Array
 from s4a.study.processes import workers
 
 ICP, ZOOMOUT = "nearest neighbour after ICP", "pairwise ZoomOut"
 MATCH, SURFACE = "S4A, matched vertex", "S4A, registered surface"
 
 
-def simple_matches(source: Shape, target: Shape, *, k_init: int = 20) -> dict[str, np.ndarray]:
+def simple_matches(
+    source: Shape, target: Shape, vertex: Array, *, k_init: int = 20
+) -> dict[str, Array]:
     """Return baseline matches: nearest neighbour after ICP, and ZoomOut with eq. 4 (4.1).
 
     Parameters
     ----------
     source, target : Shape
+    vertex : int ndarray (v,)
+        Vertices of the target to match.
 
     Returns
     -------
     dict
-        Method -> int ndarray (n_target,), vertices of the source.
+        Method -> int ndarray (v,), vertices of the source.
     """
     M, N = source.low, target.low
     R, t, _ = align(M.cloud, N.cloud)
@@ -39,26 +44,29 @@ def simple_matches(source: Shape, target: Shape, *, k_init: int = 20) -> dict[st
     C = map_after_alignment(M, N, (R, t), k_init=k_init).C
     k = min(M.k, N.k)
     C, _ = fmap.zoomout(M, N, C, k)
-    match, *_ = match_functions(source, target, M.Phi[:, :k] @ C.T, N.Phi[:, :k])
-    return {ICP: near, ZOOMOUT: match}
+    queries, rows = target.full.extend(N.Phi[:, :k]), source.full.extend(M.Phi[:, :k] @ C.T)
+    return {ICP: near[vertex], ZOOMOUT: nearest_of_few(queries[vertex], rows, source.cell)}
 
 
-def _errors(source, target, registered, image, n_geodesic):
+def _errors(source, target, registered, image, n_vertices, n_geodesic):
     """Mean Euclidean errors of all methods on one shape, and geodesic ones if requested."""
-    known = np.isfinite(image).all(axis=1)
+    known = np.flatnonzero(np.isfinite(image).all(axis=1))
+    vertex = known[:: max(1, len(known) // (n_vertices or len(image)))]
+    image = image[vertex]
     (X, T), size = as_arrays(source.original), source.frame[1]
     with threadpool_limits(1):
-        matches = simple_matches(source, target) | {MATCH: registered["registered_match"].values}
+        matches = simple_matches(source, target, vertex)
+        matches[MATCH] = registered["registered_match"].values[vertex]
         R, t, s = (registered[v].values for v in ("rotation", "translation", "scale"))
         moved = target.original["position"].values + registered["displacement"].values
         images = {name: X[match] for name, match in matches.items()}
-        images[SURFACE] = (moved - t) @ R / s
+        images[SURFACE] = (moved[vertex] - t) @ R / s
         errors = {
-            name: [np.linalg.norm(X_image - image, axis=1)[known].mean() / size, np.nan]
+            name: [np.linalg.norm(X_image - image, axis=1).mean() / size, np.nan]
             for name, X_image in images.items()
         }
         if n_geodesic:
-            sample = np.flatnonzero(known)[:: max(1, known.sum() // n_geodesic)]
+            sample = np.arange(0, len(vertex), max(1, len(vertex) // n_geodesic))
             true = cKDTree(X).query(image[sample])[1]
             matched = np.concatenate([match[sample] for match in matches.values()])
             error = geodesic_error(X, T, matched, np.tile(true, len(matches)))
@@ -69,8 +77,9 @@ def _errors(source, target, registered, image, n_geodesic):
 
 def accuracy(
     study: xr.DataTree,
-    image: Callable[[str, str], np.ndarray],
+    image: Callable[[str, str], Array],
     *,
+    n_vertices: int | None = None,
     n_geodesic: int = 0,
     n_jobs: int | None = None,
 ) -> xr.Dataset:
@@ -83,6 +92,8 @@ def accuracy(
     image : callable
         ``image(shape, template)`` gives the true position of every template vertex on the shape, in
         the frame of its file, ``(n_template, 3)``; NaN if unknown.
+    n_vertices : int, optional
+        Number of vertices, evenly spaced in their order, whose errors are averaged; all by default.
     n_geodesic : int
         Number of vertices at which geodesic errors along edges are computed as well (Princeton
         protocol, between the vertex nearest to the true position and the matched one); slow.
@@ -116,6 +127,7 @@ def accuracy(
             target,
             registration[keep].sel(shape=name).load(),
             np.asarray(image(name, template)),
+            n_vertices,
             n_geodesic,
         )
         for name in names

@@ -35,7 +35,7 @@ from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input.collection import Mesh, as_mesh, read_shapes
 from s4a.input.coordinates import in_one_system
 from s4a.input.landmarks import locate
-from s4a.input.raw import content, npy, shown, text_of
+from s4a.input.raw import content, npy, reading, text_of
 from s4a.method import latent, median, network
 from s4a.method.alignment import IDENTITY, pair_transform, transform_onto
 from s4a.method.initial_map import map_after_alignment
@@ -43,7 +43,7 @@ from s4a.method.register import latent_functions, log_area_ratio, match_function
 from s4a.method.shape import Basis, Shape
 from s4a.options import PRESETS as STUDY_PRESETS
 from s4a.options import Options, apply_preset
-from s4a.schema import check_choice, check_count, check_switch, dataset, variable
+from s4a.schema import Array, check_choice, check_count, check_switch, dataset, variable
 from s4a.seeds import RNG, seed_of
 
 log = logging.getLogger(__name__)
@@ -89,7 +89,7 @@ def load_mesh(shape: Mesh, what: str) -> tuple[xr.Dataset, float]:
     return mesh, 0.0 if mesh is shape else time.process_time() - begin
 
 
-def in_mesh(vertices: np.ndarray, mesh: xr.Dataset) -> np.ndarray:
+def in_mesh(vertices: Array, mesh: xr.Dataset) -> Array:
     """Convert rows of a file to vertices of its clean mesh ``(n,)``.
 
     Rows that are -1, or were dropped by cleaning, become -1.
@@ -100,7 +100,7 @@ def in_mesh(vertices: np.ndarray, mesh: xr.Dataset) -> np.ndarray:
     return np.where(vertices >= 0, became[np.maximum(vertices, 0)], -1)
 
 
-def ground_truth_in_meshes(truth: np.ndarray, source: xr.Dataset, target: xr.Dataset) -> np.ndarray:
+def ground_truth_in_meshes(truth: Array, source: xr.Dataset, target: xr.Dataset) -> Array:
     """Convert ground truth for the rows of files to ground truth for clean meshes.
 
     Parameters
@@ -121,20 +121,15 @@ def ground_truth_in_meshes(truth: np.ndarray, source: xr.Dataset, target: xr.Dat
     return truth if truth.ndim == 2 else in_mesh(truth, source)
 
 
-def read_ground_truth(path: Path | str) -> np.ndarray:
+def read_ground_truth(path: Path | str) -> Array:
     """Read ground truth for the vertices of the target's file.
 
     NPY, or text with one or three numbers in each row.
     """
-    try:
-        data = content(path)
-        delimiter = "," if str(path).endswith(".csv") else None
-        as_text = not str(path).endswith(".npy")
-        truth = (
-            np.loadtxt(io.StringIO(text_of(data)), delimiter=delimiter) if as_text else npy(data)
-        )
-    except ValueError as error:
-        raise ValueError(f"{shown(path)} cannot be read as truth: {shown(error)}") from error
+    with reading(path, "truth"):
+        data, mark = content(path), "," if str(path).endswith(".csv") else None
+        is_npy = str(path).endswith(".npy")
+        truth = npy(data) if is_npy else np.loadtxt(io.StringIO(text_of(data)), delimiter=mark)
     whole = truth.ndim == 1 and np.array_equal(truth, np.round(truth))
     return truth.astype(np.int64) if whole else truth
 
@@ -285,7 +280,9 @@ def compare(
     table = table.assign_attrs(options | {"n_coarse": n_coarse, "seed": seed} | joint_note(notes))
     if not keep:
         return table
-    return xr.DataTree.from_dict({"metrics": table, "source": without_coords(M.mesh), **nodes})
+    return xr.DataTree.from_dict(
+        {"metrics": table, "source": M.mesh.drop_vars(M.mesh.coords), **nodes}
+    )
 
 
 def note_on_k(k: int, least: int) -> dict[str, str]:
@@ -301,11 +298,6 @@ def joint_note(notes: Mapping[str, str]) -> dict[str, str]:
         return {}
     log.warning("%s", note)
     return {"note": note}
-
-
-def without_coords(mesh: xr.Dataset) -> xr.Dataset:
-    """Return a mesh without the coordinates that it inherited from a tree."""
-    return mesh.drop_vars(list(mesh.coords))
 
 
 def with_results(
@@ -344,11 +336,11 @@ def with_results(
         errors = np.linalg.norm(np.stack(images) - true, axis=2) / np.sqrt(vertex_areas(X, T).sum())
         variables |= {"true_position": true, "true_match": vertex.astype(np.int32)}
         variables["algorithm_error"] = errors.astype(np.float32)
-    mesh = without_coords(target).merge(dataset(None, **variables))
+    mesh = target.drop_vars(target.coords).merge(dataset(None, **variables))
     return mesh.assign_coords(algorithm=list(outcomes))
 
 
-def stacked(maps: list[np.ndarray | None]) -> np.ndarray:
+def stacked(maps: list[Array | None]) -> Array:
     """Stack maps in one array, padded with NaN.
 
     Examples
@@ -372,7 +364,7 @@ def landmarks_of(given: Any, source: Spaces, target: Spaces, clean: bool) -> Mat
     Positions ``(p, 3)``, or those of a Dataset of :func:`s4a.input.annotations.read_landmarks`,
     give the nearest vertices, rows of files those of the clean meshes.
     """
-    ends: list[np.ndarray] = []
+    ends: list[Array] = []
     for marks, space in zip(given, (source, target), strict=True):
         if isinstance(marks, xr.Dataset):
             marks = locate(marks, space.mesh, farthest=FARTHEST)["landmark_position"]
@@ -393,7 +385,7 @@ def landmarks_of(given: Any, source: Spaces, target: Spaces, clean: bool) -> Mat
 
 
 def metrics_of_pair(
-    pair: Pair, methods: Sequence[str], load: float, truth: np.ndarray | None, n_geodesic: int
+    pair: Pair, methods: Sequence[str], load: float, truth: Array | None, n_geodesic: int
 ) -> tuple[xr.Dataset, dict[str, Outcome]]:
     """Run all methods on one pair; return metrics and times, and the outcomes."""
     outcomes = {method: pair.run(method) for method in methods}
@@ -505,21 +497,19 @@ class LatentCollection(NamedTuple):
 
     spaces: list[Spaces]
     shapes: list[Shape]
-    Y: np.ndarray  # (n_shape, k, m)
+    Y: Array  # (n_shape, k, m)
     template: int
     distance_to_limit: xr.Variable
     seconds: list[float]
 
-    def functions(
-        self, source: int, target: int, dense_match: str
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def functions(self, source: int, target: int, dense_match: str) -> tuple[Array, Array]:
         """Return the functions of both shapes that eq. 4 or eq. 7 compares, at low resolution."""
         ends = self.shapes[source], self.shapes[target], (self.Y[source], self.Y[target])
         if dense_match == DENSE_MATCHES[0]:
             return match_low(*ends, dense_match=dense_match)[1]
         return latent_functions(*ends)
 
-    def match(self, source: int, target: int, dense_match: str) -> np.ndarray:
+    def match(self, source: int, target: int, dense_match: str) -> Array:
         """Return the matched vertices of the source ``(n_target,)`` by eq. 4 or eq. 7."""
         functions = self.functions(source, target, dense_match)
         return match_functions(self.shapes[source], self.shapes[target], *functions)[0]
@@ -574,7 +564,7 @@ def latent_collection(
     )
 
 
-def initial_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def initial_maps(bases: list[Basis], options: Options) -> tuple[Array, Array, Array]:
     """Compute initial maps of a network: sources and targets ``(p,)``, maps ``(p, k, k)``."""
     k_init = min(options.k_init, *(basis.k for basis in bases))
     distance = network.spectral_distance([basis.eigenvalue[:k_init] for basis in bases])
@@ -596,7 +586,7 @@ def initial_maps(bases: list[Basis], options: Options) -> tuple[np.ndarray, np.n
     return *np.array(ends).T, np.stack(maps)
 
 
-def chamfer_to_template(found: LatentCollection, dense_match: str) -> tuple[np.ndarray, float]:
+def chamfer_to_template(found: LatentCollection, dense_match: str) -> tuple[Array, float]:
     """Return eq. 9 of each shape and the image of the template ``(n,)``, and CPU seconds."""
     chamfer = np.full(len(found.shapes), np.nan)
     seconds = 0.0

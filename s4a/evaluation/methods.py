@@ -37,6 +37,7 @@ from s4a.method.remesh import coarsen, laplacian
 from s4a.method.scalable import local_space, spectral_space
 from s4a.method.shape import Basis, Shape
 from s4a.method.spectral import eigenpairs, spectrum
+from s4a.schema import Array
 
 PAPER_METHODS = ("kNN", "ZO", "FMAP+ZO", "SCALABLE", "RE-MATCH")
 S4A_METHODS = ("RE-MATCH refined", "registered", "registered surface")
@@ -49,7 +50,7 @@ BLOCKS = ("load and clean", "align", "sample", "basis", "map", "refine", "full r
 N_SAMPLES = 3000  # samples of each shape for alignment and for grouping dense searches
 INITS = ("landmarks", "descriptors")  # kinds of initial maps
 
-Matches = tuple[np.ndarray, np.ndarray]
+Matches = tuple[Array, Array]
 
 
 class Clock(defaultdict[str, float]):
@@ -88,12 +89,12 @@ class Spaces:
     clock: Clock = field(default_factory=Clock)
 
     @cached_property
-    def X(self) -> np.ndarray:
+    def X(self) -> Array:
         """Vertices centred and for unit area ``(n, 3)``."""
         return Shape(self.mesh).to_frame(self.mesh["position"].values)
 
     @cached_property
-    def samples(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def samples(self) -> tuple[Array, Array, Array]:
         """Samples ``(p, 3)``, their areas, which sum to 1, and the nearest one of each vertex."""
         return self.clock("samples", self._samples)
 
@@ -145,23 +146,14 @@ class Spaces:
         )
 
 
-def functions_at_all_vertices(shape: Shape, C: np.ndarray | None = None) -> np.ndarray:
-    """Return the functions of a shape, or Phi C^T, at all its vertices ``(n, k)``."""
-    Phi = shape.full.Phi
-    F = Phi if C is None else Phi[:, : C.shape[1]] @ C.T.astype(Phi.dtype)
-    return shape.full.extend(F)
-
-
-def match_in_space(
-    source: Spaces, target: Spaces, transform: tuple[np.ndarray, np.ndarray]
-) -> Matches:
+def match_in_space(source: Spaces, target: Spaces, transform: tuple[Array, Array]) -> Matches:
     """Match aligned shapes by nearest neighbours in space (kNN), in both directions."""
     R, t = transform
     moved = source.X @ R.T + t
     return cKDTree(moved).query(target.X)[1], cKDTree(target.X).query(moved)[1]
 
 
-def at_low_resolution(M: Shape, N: Shape, landmarks: Matches) -> list[np.ndarray]:
+def at_low_resolution(M: Shape, N: Shape, landmarks: Matches) -> list[Array]:
     """Return landmarks as vertices of the low-resolution shapes, if there are any."""
     return [
         mark if shape.U is None else shape.cell[mark]
@@ -169,7 +161,7 @@ def at_low_resolution(M: Shape, N: Shape, landmarks: Matches) -> list[np.ndarray
     ]
 
 
-def fit_map(M: Shape, N: Shape, landmarks: Matches, k: int) -> np.ndarray:
+def fit_map(M: Shape, N: Shape, landmarks: Matches, k: int) -> Array:
     """Fit the initial map ``(k, k)`` to wave kernels, see :func:`fmap.fmap_from_descriptors`."""
     at_source, at_target = at_low_resolution(M, N, landmarks)
     bases = [replace(shape.low, area=shape.low.area / shape.low.area.sum()) for shape in (M, N)]
@@ -179,11 +171,11 @@ def fit_map(M: Shape, N: Shape, landmarks: Matches, k: int) -> np.ndarray:
 class Outcome(NamedTuple):
     """Result of one method on one pair; spectral methods also have maps and functions."""
 
-    match: np.ndarray  # (n_target,)
-    image: np.ndarray | None  # (n_target, 3), if the method gives positions between vertices
+    match: Array  # (n_target,)
+    image: Array | None  # (n_target, 3), if the method gives positions between vertices
     reverse: Any  # (n_source,), match in the other direction
     seconds: dict[str, float]
-    initial: np.ndarray | None = None  # (k_init, k_init), the initial map
+    initial: Array | None = None  # (k_init, k_init), the initial map
     fmap: Any = None  # (k, k), the refined one
     functions: Any = None  # at all vertices, of source and target
     low_match: Any = None  # (n_low_target,)
@@ -317,8 +309,8 @@ class Pair:
         if kind == "refined":
             for _ in range(self.full_resolution_iterations):
                 C = clock("refine", refine_at_full_resolution, M, N, C, M.full.Phi)
-        F = clock("full resolution", functions_at_all_vertices, M, C)
-        G = functions_at_all_vertices(N)[:, :k]
+        F = clock("full resolution", lambda: M.full.extend(M.functions(C.T)))
+        G = N.full.extend(N.full.Phi[:, :k])
         match = low_match
         if kind != "dense":
             match, *_ = clock("full resolution", nearest_in_cells, G, N.cell, F, M.cell)

@@ -22,17 +22,17 @@ from s4a.geometry.mesh import (
     vertex_areas,
 )
 from s4a.method.deform import distortion as distortion
-from s4a.schema import dataset, require
+from s4a.schema import Array, check_choice, check_rows, dataset, require
 
 THRESHOLDS = np.linspace(0, 0.25, 101)  # of the error curve, as in Kim et al. (2011), Fig. 6
 
 
-def nearest_distances(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def nearest_distances(X: Array, Y: Array) -> tuple[Array, Array]:
     """Return distances to the nearest point: ``(n,)`` from X to Y, ``(p,)`` from Y to X."""
     return cKDTree(Y).query(X)[0], cKDTree(X).query(Y)[0]
 
 
-def chamfer(X: np.ndarray, Y: np.ndarray) -> float:
+def chamfer(X: Array, Y: Array) -> float:
     """Chamfer distance of two point sets (eq. 9).
 
     Sum of the mean distances to the nearest point in both directions.
@@ -62,7 +62,7 @@ def chamfer(X: np.ndarray, Y: np.ndarray) -> float:
     return float(sum(distance.mean() for distance in nearest_distances(X, Y)))
 
 
-def hausdorff(X: np.ndarray, Y: np.ndarray, formula: str = "standard") -> float:
+def hausdorff(X: Array, Y: Array, formula: str = "standard") -> float:
     """Hausdorff distance of two point sets (eq. 10): largest distance to the nearest point.
 
     It sees only the worst point, and like :func:`chamfer` it cannot see permutations.
@@ -91,13 +91,12 @@ def hausdorff(X: np.ndarray, Y: np.ndarray, formula: str = "standard") -> float:
     >>> s4a.metrics.hausdorff(X, Y), s4a.metrics.hausdorff(X, Y, "paper")
     (2.0, 2.0)
     """
-    if formula not in ("standard", "paper"):
-        raise ValueError(f"formula must be 'standard' or 'paper', found {formula!r}")
+    check_choice("formula", formula, ("standard", "paper"))
     forth, back = (distance.max() for distance in nearest_distances(X, Y))
     return float(max(forth, back) if formula == "standard" else forth + back / len(Y))
 
 
-def dirichlet(f: np.ndarray, E: np.ndarray, w: np.ndarray) -> float:
+def dirichlet(f: Array, E: Array, w: Array) -> float:
     """Dirichlet energy f^T A L f of functions on the vertices (eq. 11), summed over functions.
 
     With L = A^-1 W it is f^T W f, the sum of w (f_i - f_j)^2 over the edges: the areas cancel, and
@@ -134,9 +133,7 @@ def dirichlet(f: np.ndarray, E: np.ndarray, w: np.ndarray) -> float:
     return float(w @ (difference**2).sum(axis=1))
 
 
-def geodesic_error(
-    X: np.ndarray, T: np.ndarray, match: np.ndarray, true: np.ndarray, *, limit: float = 1.0
-) -> np.ndarray:
+def geodesic_error(X: Array, T: Array, match: Array, true: Array, *, limit: float = 1.0) -> Array:
     """Return distances from true to matched vertices along edges, as shares of sqrt(area).
 
     Princeton protocol with paths along edges, which are up to 10 % longer than geodesics.  It sees
@@ -175,7 +172,7 @@ def geodesic_error(
     )
 
 
-def error_curve(error: np.ndarray, thresholds: ArrayLike = THRESHOLDS) -> np.ndarray:
+def error_curve(error: Array, thresholds: ArrayLike = THRESHOLDS) -> Array:
     """Return the share of errors up to each threshold ``(t,)``.
 
     The cumulative curve of the Princeton protocol distinguishes few gross errors from many small
@@ -191,7 +188,7 @@ def error_curve(error: np.ndarray, thresholds: ArrayLike = THRESHOLDS) -> np.nda
     return np.searchsorted(np.sort(error), thresholds, side="right") / len(error)
 
 
-def coverage(match: np.ndarray, area: np.ndarray) -> float:
+def coverage(match: Array, area: Array) -> float:
     """Return the share of the source's area whose vertices are matched by the target.
 
     It sees a map that collapses.  It cannot see a wrong map: a random permutation scores 1.  If the
@@ -212,13 +209,7 @@ def coverage(match: np.ndarray, area: np.ndarray) -> float:
     return float(area[np.unique(match)].sum() / area.sum())
 
 
-def cycle_error(
-    X: np.ndarray,
-    T: np.ndarray,
-    *matches: np.ndarray,
-    vertices: np.ndarray | None = None,
-    limit: float = 1.0,
-) -> np.ndarray:
+def cycle_error(X: Array, T: Array, *matches: Array, vertices: Array | None = None) -> Array:
     """Return the distance of vertices from their images under a cycle of matches.
 
     It sees inconsistent matches without ground truth.  It cannot see errors that cancel: a
@@ -252,48 +243,10 @@ def cycle_error(
     end = start
     for match in matches:
         end = match[end]
-    return geodesic_error(X, T, end, start, limit=limit)
+    return geodesic_error(X, T, end, start)
 
 
-def bijectivity(
-    X: np.ndarray,
-    T: np.ndarray,
-    match: np.ndarray,
-    reverse: np.ndarray,
-    *,
-    vertices: np.ndarray | None = None,
-    limit: float = 1.0,
-) -> np.ndarray:
-    """Return the :func:`cycle_error` target -> source -> target; 0 for a map and its inverse.
-
-    Parameters
-    ----------
-    X, T : mesh of the target
-    match : int ndarray (n_target,)
-        Vertices of the source.
-    reverse : int ndarray (n_source,)
-        Vertices of the target.
-    vertices : int ndarray (p,), optional
-        Of the target; all by default.
-
-    Returns
-    -------
-    float ndarray (p,)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import s4a
-    >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])  # a square
-    >>> T = np.array([[0, 1, 2], [0, 2, 3]])
-    >>> rotate = np.array([1, 2, 3, 0])
-    >>> s4a.metrics.bijectivity(X, T, rotate, np.argsort(rotate)).tolist()
-    [0.0, 0.0, 0.0, 0.0]
-    """
-    return cycle_error(X, T, match, reverse, vertices=vertices, limit=limit)
-
-
-def label_accuracy(label: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> float:
+def label_accuracy(label: ArrayLike, true: ArrayLike, area: Array | None = None) -> float:
     """Return the share of the vertices, or of the area, with the correct label.
 
     It sees gross errors only, as most vertices are far from any border; :func:`dice` also sees
@@ -317,7 +270,7 @@ def label_accuracy(label: ArrayLike, true: ArrayLike, area: np.ndarray | None = 
     return float(np.average(np.asarray(label) == np.asarray(true), weights=area))
 
 
-def dice(label: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> dict[Any, float]:
+def dice(label: ArrayLike, true: ArrayLike, area: Array | None = None) -> dict[Any, float]:
     """Return the Dice coefficient 2 |A n B| / (|A| + |B|) of each label, by vertices or area.
 
     It sees each region, small ones like large ones.  It cannot see errors inside a region.
@@ -352,7 +305,7 @@ def dice(label: ArrayLike, true: ArrayLike, area: np.ndarray | None = None) -> d
     return overlap
 
 
-def landmark_error(position: ArrayLike, true: ArrayLike) -> np.ndarray:
+def landmark_error(position: ArrayLike, true: ArrayLike) -> Array:
     """Return Euclidean distances of landmarks from the true ones ``(p,)``, in their unit.
 
     It sees the map at a few points that an expert has marked, including the expert's error, and
@@ -361,15 +314,13 @@ def landmark_error(position: ArrayLike, true: ArrayLike) -> np.ndarray:
     return np.linalg.norm(np.asarray(position) - np.asarray(true), axis=-1)
 
 
-def _weighted_median(values, weight):
-    if not len(values):
-        return np.inf
-    order = np.argsort(values)
-    total = np.cumsum(weight[order])
-    return values[order[np.searchsorted(total, total[-1] / 2)]]
+def _median(values, weight):
+    """Weighted median; infinite without values."""
+    weighted = {"weights": weight, "method": "inverted_cdf"}
+    return np.quantile(values, 0.5, **weighted) if len(values) else np.inf
 
 
-def true_positions(truth: ArrayLike, X: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+def true_positions(truth: ArrayLike, X: Array, n: int) -> tuple[Array, Array]:
     """Convert ground truth of :func:`evaluate` to positions and to vertices of the source.
 
     Parameters
@@ -438,10 +389,10 @@ def _evenly_spaced(n, most):
 def evaluate(
     source: xr.Dataset,
     target: xr.Dataset,
-    match: np.ndarray,
+    match: Array,
     *,
-    image: np.ndarray | None = None,
-    reverse: np.ndarray | None = None,
+    image: Array | None = None,
+    reverse: Array | None = None,
     truth: ArrayLike | None = None,
     n_geodesic: int = 1000,
     thresholds: ArrayLike = THRESHOLDS,
@@ -517,11 +468,7 @@ def evaluate(
     match = _check_match(match, target, source, "match")
     area, area_target = vertex_areas(X, T), vertex_areas(Y, S)
     size, size_target = np.sqrt(area.sum()), np.sqrt(area_target.sum())
-    image = X[match] if image is None else np.asarray(image, float)
-    if image.shape != Y.shape:
-        raise ValueError(
-            f"image needs a position for each vertex of the target, {Y.shape}; found {image.shape}"
-        )
+    image = X[match] if image is None else check_rows("image", image, Y.shape).astype(float)
     forth, back = nearest_distances(X / size, image / size)
     conformal, growth = distortion(Y / size_target, image / size, S)
     weight = triangle_areas(Y, S)
@@ -532,14 +479,14 @@ def evaluate(
         "hausdorff_paper": forth.max() + back.max() / len(image),
         "dirichlet": dirichlet(image / size, *cotan_weights(Y, S)),
         "coverage": coverage(match, area),
-        "conformal_distortion": _weighted_median(conformal[regular], weight[regular]),
-        "area_distortion": _weighted_median(np.abs(growth[regular]), weight[regular]),
+        "conformal_distortion": _median(conformal[regular], weight[regular]),
+        "area_distortion": _median(np.abs(growth[regular]), weight[regular]),
         "collapsed_share": weight[collapsed].sum() / weight.sum(),
     }
     if reverse is not None:
         reverse = _check_match(reverse, source, target, "reverse")
         sample = _evenly_spaced(len(Y), n_geodesic)
-        result["bijectivity"] = bijectivity(Y, S, match, reverse, vertices=sample).mean()
+        result["bijectivity"] = cycle_error(Y, S, match, reverse, vertices=sample).mean()
     coords = {}
     if truth is not None:
         position, vertex = true_positions(truth, X, len(Y))

@@ -21,7 +21,7 @@ from s4a.input.files import stem_of
 from s4a.input.formats import gifti_arrays, ply_properties
 from s4a.input.raw import check_there, content, npy, npz, reading, shown, text_of, xml
 from s4a.options import MILLIMETRES, check_unit
-from s4a.schema import dataset, require, unit_of
+from s4a.schema import Array, check_rows, dataset, require, unit_of
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ _MARKUPS = (
 _FORMULA = r"[=+@\t\r-]."  # the beginning of a cell that a spreadsheet evaluates
 
 
-def read_labels(path: Path | str, n: int | None = None) -> np.ndarray:
+def read_labels(path: Path | str, n: int | None = None) -> Array:
     """Read one label per vertex from a file.
 
     Parameters
@@ -118,19 +118,15 @@ def _gifti_vector(data, intent="LABEL"):
     return found[0]
 
 
-class _Cursor:
+class _Cursor(io.BytesIO):
     """Reader of consecutive big-endian integers and length-prefixed texts."""
-
-    def __init__(self, data):
-        self.data, self.at = data, 0
 
     def take(self, count):
         """Read the next bytes."""
-        rest = len(self.data) - self.at
+        rest = len(self.getbuffer()) - self.tell()
         if not 0 <= count <= rest:
             raise ValueError(f"expected {count} bytes, found {rest}: the file is cut short")
-        self.at += count
-        return self.data[self.at - count : self.at]
+        return self.read(count)
 
     def numbers(self, count):
         return np.frombuffer(self.take(4 * count), ">i4").astype(np.int64)
@@ -217,10 +213,11 @@ def table_rows(text: str) -> dict[int, list[str]]:
     return rows
 
 
-def write_rows(path: Path | str, rows: Iterable[Iterable[Any]]) -> None:
-    """Write a CSV file; a text that a spreadsheet would take for a formula gets an apostrophe.
+def write_rows(path: Path, rows: Iterable[Iterable[Any]]) -> Path:
+    """Write a CSV file and return its path.
 
-    :func:`table_rows` removes the apostrophe.
+    A text that a spreadsheet would take for a formula gets an apostrophe, which
+    :func:`table_rows` removes.
 
     Examples
     --------
@@ -228,12 +225,12 @@ def write_rows(path: Path | str, rows: Iterable[Iterable[Any]]) -> None:
     >>> from pathlib import Path
     >>> from s4a.input.annotations import write_rows
     >>> path = Path(tempfile.mkdtemp()) / "table.csv"
-    >>> write_rows(path, [["a", "=1+1", "-3.2", -3.2]])
-    >>> path.read_text().strip()
+    >>> write_rows(path, [["a", "=1+1", "-3.2", -3.2]]).read_text().strip()
     "a,'=1+1,-3.2,-3.2"
     """
     with open(path, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([[_escaped(cell) for cell in row] for row in rows])
+    return path
 
 
 def _escaped(cell):
@@ -533,7 +530,7 @@ def write_landmarks(path: Path | str, landmarks: xr.Dataset) -> None:
     if "landmark_curve" in landmarks:
         head += ["curve", "closed"]
         columns += [landmarks["landmark_curve"].values, landmarks["landmark_closed"].values]
-    write_rows(path, [head, *zip(*(column.tolist() for column in columns), strict=True)])
+    write_rows(Path(path), [head, *zip(*(column.tolist() for column in columns), strict=True)])
 
 
 def _markups(landmarks):
@@ -569,7 +566,7 @@ def _markups(landmarks):
     return {"@schema": _MARKUPS, "markups": lists}
 
 
-def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> np.ndarray:
+def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> Array:
     """Map labels from the vertices of a file to those of the cleaned mesh.
 
     Raises
@@ -587,18 +584,12 @@ def labels_of_mesh(labels: ArrayLike, mesh: xr.Dataset) -> np.ndarray:
     [7, 5]
     """
     require(mesh, "file_vertex", "vertex_of_file", what="mesh")
-    n = mesh.sizes["file_vertex_index"]
-    if np.shape(labels) != (n,):
-        raise ValueError(
-            f"{n} labels, one per vertex of the file of the mesh, needed, "
-            f"found shape {np.shape(labels)}"
-        )
-    return np.asarray(labels)[mesh["file_vertex"].values]
+    shape = (mesh.sizes["file_vertex_index"],)
+    labels = check_rows("label", labels, shape, of="vertices of the file of the mesh")
+    return labels[mesh["file_vertex"].values]
 
 
-def labels_of_file(
-    labels: np.ndarray, mesh: xr.Dataset, points: np.ndarray
-) -> tuple[np.ndarray, int]:
+def labels_of_file(labels: Array, mesh: xr.Dataset, points: Array) -> tuple[Array, int]:
     """Map labels from the vertices of a cleaned mesh to those of its file.
 
     Parameters
@@ -635,7 +626,7 @@ _CURV = b"\xff\xff\xff"  # first bytes of FreeSurfer's curvature files
 SUFFIXES = (".npy", ".npz", ".ply", ".csv", ".txt", ".gii")
 
 
-def read_scalars(path: Path | str, name: str = "", n: int | None = None) -> np.ndarray:
+def read_scalars(path: Path | str, name: str = "", n: int | None = None) -> Array:
     """Read one number per vertex from a file.
 
     Parameters
@@ -681,7 +672,7 @@ def read_scalars(path: Path | str, name: str = "", n: int | None = None) -> np.n
     return values.astype(float)
 
 
-def of_vertices(values: Any, mesh: xr.Dataset, what: str) -> np.ndarray:
+def of_vertices(values: Any, mesh: xr.Dataset, what: str) -> Array:
     """Return a field ``(n,)`` on the vertices of a clean mesh, given for these or for its file.
 
     Raises ValueError, with `what` as the name of the field, if the values are not numbers, have
@@ -692,12 +683,7 @@ def of_vertices(values: Any, mesh: xr.Dataset, what: str) -> np.ndarray:
         raise ValueError(f"{what} needs numbers, found {values.dtype}")
     n = mesh.sizes["vertex"]
     n_file = mesh.sizes.get("file_vertex_index", n)
-    if values.shape not in ((n,), (n_file,)):
-        of_file = "" if n == n_file else f", or each of the {n_file} of its file"
-        raise ValueError(
-            f"{what} needs a number for each of the {n} vertices of its mesh{of_file}; found shape "
-            f"{values.shape}"
-        )
+    check_rows(what, values, (n,), (n_file,), of="vertices of its mesh, or of its file")
     if len(values) == n_file and "file_vertex" in mesh:
         values = values[mesh["file_vertex"].values]
     values = values.astype(float)

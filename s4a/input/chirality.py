@@ -14,6 +14,7 @@ import xarray as xr
 from s4a.input.columns import check_column
 from s4a.input.coordinates import CoordinateSystem, file_system, map_between, moved, transformed
 from s4a.input.subjects import listed
+from s4a.schema import Array
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
 COMMON_SIDE, OTHER_SIDE = 0.8, 0.5  # least |mean chirality|: median of all shapes, of one shape
@@ -48,19 +49,19 @@ def mirror_image(mesh: xr.Dataset) -> xr.Dataset:
     return image.assign_attrs(reflected=reflected, reason="; ".join(filter(None, reasons)))
 
 
-def map_to_file(attrs: Mapping[Any, Any]) -> np.ndarray:
+def map_to_file(attrs: Mapping[Any, Any]) -> Array:
     """Return the map (4, 4) of a mesh with these attributes to the coordinates of its file."""
     M = np.diag([*MIRROR, 1.0]) if attrs.get("reflected") else np.eye(4)
     return map_between(CoordinateSystem.of(attrs), file_system(attrs), "a mesh") @ M
 
 
-def in_file(mesh: xr.Dataset, X: np.ndarray, *, back: bool = False) -> np.ndarray:
+def in_file(mesh: xr.Dataset, X: Array, *, back: bool = False) -> Array:
     """Transform points ``(n, 3)`` of a mesh to the coordinates of its file, or back."""
     M = map_to_file(mesh.attrs)
     return moved(X, np.linalg.inv(M) if back else M)
 
 
-def mean_chirality(comparisons: Mapping[str, xr.Dataset]) -> np.ndarray:
+def mean_chirality(comparisons: Mapping[str, xr.Dataset]) -> Array:
     """Mean chirality of each shape ``(n,)``, positive on the more common side.
 
     On a tie, the side of the first shape is positive.
@@ -87,12 +88,13 @@ def mean_chirality(comparisons: Mapping[str, xr.Dataset]) -> np.ndarray:
     # a reference that is not among the shapes has the sign that they agree on
     reference_sign = np.where(np.nan_to_num(chirality.T) @ sign < 0, -1, 1)
     reference_sign[is_shape] = sign[index]
-    mean = _mean(chirality * reference_sign)
+    known = np.isfinite(chirality).sum(1)
+    mean = np.nansum(chirality * reference_sign, axis=1) / np.maximum(known, 1)
     negative, positive = (mean < 0).sum(), (mean > 0).sum()
     return -mean if (negative, mean[0] < 0) > (positive, mean[0] > 0) else mean
 
 
-def signs(similarity: np.ndarray) -> np.ndarray:
+def signs(similarity: Array) -> Array:
     """Signs ``(n,)`` that agree best with pairwise similarities, by the leading eigenvector.
 
     Parameters
@@ -114,11 +116,6 @@ def signs(similarity: np.ndarray) -> np.ndarray:
     leading = np.linalg.eigh(symmetric)[1][:, -1]
     sign = np.where(leading < 0, -1, 1)
     return sign * sign[0]
-
-
-def _mean(chirality):
-    is_known = np.isfinite(chirality)
-    return np.where(is_known, chirality, 0).sum(1) / np.maximum(is_known.sum(1), 1)
 
 
 def fits_mirrored(

@@ -4,6 +4,8 @@ Half-edge ``h = t + m * i`` of m triangles runs from corner i of triangle t to i
 mate is the half-edge of the neighbour across the edge, -1 if there is none.
 """
 
+import re
+
 import numpy as np
 import scipy.sparse as sp
 import xarray as xr
@@ -24,7 +26,7 @@ from s4a.geometry.mesh import (
     unique_edges,
 )
 from s4a.options import check_components
-from s4a.schema import require
+from s4a.schema import Array, require
 
 # share of the bounding-box diagonal within which vertices are welded and triangles are flat
 _RELATIVE_TOLERANCE = 1e-7
@@ -50,14 +52,6 @@ REPAIRS = {
     "dropped_components": "components dropped",
     "unreferenced_vertices": "vertices without triangles dropped",
     "closed_holes": "holes closed",
-}
-_SINGULAR = {
-    "vertices": "vertex",
-    "triangles": "triangle",
-    "edges": "edge",
-    "sides": "side",
-    "components": "component",
-    "holes": "hole",
 }
 
 
@@ -132,13 +126,13 @@ def clean(
 
 
 def clean_arrays(
-    points: np.ndarray,
-    triangles: np.ndarray,
+    points: Array,
+    triangles: Array,
     *,
     components: str | int = "largest",
     strict: bool = False,
     close_holes: bool = False,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, int | float]]:
+) -> tuple[Array, Array, Array, Array, dict[str, int | float]]:
     """Clean a mesh given as arrays; see :func:`clean`.
 
     Returns
@@ -210,7 +204,7 @@ def repairs(counts: dict[str, int | float]) -> str:
 
 
 def counted(n: float, text: str) -> str:
-    """Put a number before its noun, in singular or plural.
+    """Put a number before its noun, the first plural of the text; in the singular after 1.
 
     Examples
     --------
@@ -219,12 +213,11 @@ def counted(n: float, text: str) -> str:
     ('1 hole closed', '2 holes closed')
     """
     if n == 1:
-        plural = next(word for word in text.split() if word in _SINGULAR)
-        text = text.replace(plural, _SINGULAR[plural], 1)
+        text = re.sub(r"vertices|(\w+)s\b", lambda plural: plural[1] or "vertex", text, count=1)
     return f"{n} {text}"
 
 
-def check_arrays(points: ArrayLike, triangles: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def check_arrays(points: ArrayLike, triangles: ArrayLike) -> tuple[Array, Array]:
     """Convert points ``(n, 3)`` to float64 and triangles ``(m, 3)`` to int64, or ValueError."""
     P, F = np.asarray(points, np.float64), np.asarray(triangles)
     if P.ndim != 2 or P.shape[1] != 3 or F.ndim != 2 or F.shape[1] != 3 or len(F) == 0:
@@ -254,7 +247,7 @@ def _drop_nonfinite(P, F, strict, counts):
     return F
 
 
-def check_range(P: np.ndarray, F: np.ndarray) -> None:
+def check_range(P: Array, F: Array) -> None:
     """Raise ValueError if coordinates are outside the numerical range.
 
     Parameters
@@ -702,7 +695,7 @@ def _split_double_edges(X, V, file_vertex, mate, counts):
     return X, V, np.r_[file_vertex, file_vertex[ends].min(axis=1)]
 
 
-def cheapest(cost: np.ndarray, ends: np.ndarray) -> np.ndarray:
+def cheapest(cost: Array, ends: Array) -> Array:
     """Greedy matching: mask of the pairs taken in order of cost, each end once.
 
     Parameters
@@ -727,7 +720,7 @@ def cheapest(cost: np.ndarray, ends: np.ndarray) -> np.ndarray:
     return taken
 
 
-def fill_holes(X: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def fill_holes(X: Array, T: Array) -> tuple[Array, Array, Array]:
     """Close every boundary loop of an oriented manifold by a fan around a new vertex.
 
     The new vertex is the mean of the loop, weighted by edge length.

@@ -25,7 +25,7 @@ from s4a.input.labels import Label, read_volume
 from s4a.input.plausibility import examine
 from s4a.input.raw import shown
 from s4a.options import Options, check, check_label
-from s4a.schema import check_type, dataset, in_unit, require
+from s4a.schema import Array, check_type, dataset, in_unit, require
 
 # columns of the report
 COUNTS = [
@@ -328,7 +328,7 @@ def shape_report(
         rows.append({**values, **_flag_columns(flags_of_shape)})
         if name in comparisons:
             rows[-1]["self_intersections"] = comparisons[name].attrs["self_intersections"]
-    columns: dict[str, list[Any] | np.ndarray] = {
+    columns: dict[str, list[Any] | Array] = {
         key: [shown(row.get(key, "")) for row in rows] for key in TEXTS
     }
     known = [CoordinateSystem() if r["status"] == "excluded" else file_system(r) for r in rows]

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import stdtr
 
 from s4a.input.subjects import is_plain_number, listed, look, look_alikes
+from s4a.schema import Array
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +27,7 @@ _LEVEL, _SLIP_LEVEL = 3e-4, 0.04  # of an outlier in a column; of a value ten ti
 
 
 def check_column(
-    values: np.ndarray, names: Sequence[str], what: str, *, categories: bool = False
+    values: Array, names: Sequence[str], what: str, *, categories: bool = False
 ) -> None:
     """Check a column before a test: missing-value codes, outliers, names that look alike.
 
@@ -152,7 +153,7 @@ def _report_codes(codes, cells, names, what, others):
     log.warning("%s: %s may be a code of a missing value%s: write NA if so", what, found, others)
 
 
-def missing_codes(x: np.ndarray) -> np.ndarray:
+def missing_codes(x: Array) -> Array:
     """Return a mask of numbers ``(n,)`` that are usual missing-value codes, and outlying.
 
     Examples
@@ -200,7 +201,7 @@ def _is_code(code, rest, count):
     return bool(gap > max(3, extent))
 
 
-def outlying(x: np.ndarray) -> np.ndarray:
+def outlying(x: Array) -> Array:
     """Return a mask of outliers of numbers ``(n,)``, in a column of any skewness.
 
     A value is compared with the others, and positive ones by their logarithms too, by the t

@@ -17,7 +17,7 @@ import xarray as xr
 from s4a.input.formats import VtkXml, freesurfer_counts
 from s4a.input.raw import xml
 from s4a.options import MILLIMETRES, check_unit
-from s4a.schema import in_unit
+from s4a.schema import Array, in_unit
 
 # RAS and LPS: world coordinates of an image, as 3D Slicer and most programs use them; surface RAS:
 # FreeSurfer's, adding c_ras gives scanner RAS; any other word is the name of a template space
@@ -134,7 +134,7 @@ class CoordinateSystem:
 
 def transform(
     source: CoordinateSystem, target: CoordinateSystem, *, origin: bool = True
-) -> np.ndarray | None:
+) -> Array | None:
     """Return the affine map (4, 4) between two systems, None if it is unknown.
 
     Parameters
@@ -164,7 +164,7 @@ def transform(
     return np.linalg.solve(B, A)
 
 
-def map_to_ras(system: CoordinateSystem, *, placed: bool) -> np.ndarray:
+def map_to_ras(system: CoordinateSystem, *, placed: bool) -> Array:
     """Return the map (4, 4) of a system to RAS in mm, or to scanner RAS if `placed`."""
     M = np.eye(4)
     for row, ends in enumerate(("RL", "AP", "SI") if system.axes else ()):
@@ -175,7 +175,7 @@ def map_to_ras(system: CoordinateSystem, *, placed: bool) -> np.ndarray:
     return M
 
 
-def map_between(source: CoordinateSystem, target: CoordinateSystem, what: str) -> np.ndarray:
+def map_between(source: CoordinateSystem, target: CoordinateSystem, what: str) -> Array:
     """Return the map (4, 4) of :func:`transform`, or ValueError with `what` if it is unknown."""
     M = transform(source, target)
     if M is None:
@@ -219,17 +219,17 @@ def only(what: str, texts: Iterable[str]) -> str:
 # meshes
 
 
-def moved(X: np.ndarray, M: np.ndarray) -> np.ndarray:
+def moved(X: Array, M: Array) -> Array:
     """Apply an affine map (4, 4) to points ``(n, 3)``; the identity returns X itself."""
     return X if np.array_equal(M, np.eye(4)) else X @ M[:3, :3].T + M[:3, 3]
 
 
-def turned(T: np.ndarray, M: np.ndarray) -> np.ndarray:
+def turned(T: Array, M: Array) -> Array:
     """Return triangles ``(m, 3)``, reversed if a map (4, 4) reflects, to face outward."""
     return np.ascontiguousarray(T[:, ::-1]) if np.linalg.det(M) < 0 else T
 
 
-def transformed(mesh: xr.Dataset, M: np.ndarray) -> xr.Dataset:
+def transformed(mesh: xr.Dataset, M: Array) -> xr.Dataset:
     """Apply an affine map (4, 4) to a mesh and its landmarks; normals stay outward."""
     apply: dict[str, Any] = {f"{name}position": moved for name in ("", "landmark_", "guide_")}
     apply |= dict.fromkeys(("corner_vertex", "landmark_barycentric", "guide_barycentric"), turned)
@@ -376,8 +376,3 @@ def _of_gifti(data):
     if len({s.axes for s in found}) == 1 and np.ptp(numbers, axis=0).max() < 1e-3:
         return found[-1]
     return CoordinateSystem("RAS", UNKNOWN, "mm")  # nothing, or two that differ
-
-
-def nifti_system(code: int) -> CoordinateSystem:
-    """Return the system of the affine map of a NIfTI or MGH volume, by NIfTI's code."""
-    return CoordinateSystem("RAS", XFORMS.get(code, ""), "mm")

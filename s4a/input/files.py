@@ -20,6 +20,7 @@ from s4a.input.formats import FORMATS, NPZ_KEYS, SURFER, format_of
 from s4a.input.labels import VOLUMES, grid_of, volume_format
 from s4a.input.polygons import triangulated
 from s4a.input.raw import check_there, content, regular_file, shown
+from s4a.schema import Array, check_rows
 
 SUFFIXES = {suffix: name for name, kind in FORMATS.items() for suffix in kind.suffixes.split()}
 SUFFIXES[".obj"] = "OBJ"  # and of MNI
@@ -33,7 +34,7 @@ _UNSEEN = re.compile("[\u034f\ufe00-\ufe0f\u115f\u1160\u3164\uffa0\u2800]")
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
-def read_mesh(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
+def read_mesh(path: str | os.PathLike[str]) -> tuple[Array, Array, dict[str, str]]:
     """Read points and triangles of a mesh file; the format is detected from the content.
 
     Parameters
@@ -171,8 +172,8 @@ def _checked(points, cells):
 
 def write_mesh(
     path: str | os.PathLike[str],
-    points: np.ndarray,
-    triangles: np.ndarray,
+    points: Array,
+    triangles: Array,
     *,
     coordinate_system: str = "",
     unit: str = "",
@@ -216,12 +217,8 @@ def write_mesh(
     """
     path = Path(path)
     points, triangles, _ = _checked(points, triangles)
-    scalars = {name: np.asarray(values) for name, values in vertex_scalars.items()}
-    for name, values in scalars.items():
-        if values.shape != (len(points),):
-            raise ValueError(
-                f"{name} needs one value for each of {len(points)} vertices, found {values.shape}"
-            )
+    shape = (len(points),)
+    scalars = {name: check_rows(name, one, shape) for name, one in vertex_scalars.items()}
     suffix = path.suffix.lower()
     if suffix not in WRITERS:
         raise ValueError(f"a name ending in {', '.join(WRITERS)} needed, found {path.name}")

@@ -11,6 +11,7 @@ OFF 0.4, 0.8 and 0.2 s.
 """
 
 import base64
+import html
 import io
 import math
 import re
@@ -18,13 +19,13 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from s4a.geometry.mesh import equal_rows
 from s4a.input.polygons import Polygons, joined, polygons, strips
 from s4a.input.raw import is_utf_16, limit_of, npz, unpack, xml
+from s4a.schema import Array
 
 _LEGACY_TYPES = {
     "char": "i1", "unsigned_char": "u1", "short": "i2", "unsigned_short": "u2", "int": "i4",
@@ -164,9 +165,7 @@ def _count_positions(values, n):
     return np.array(positions, np.int64)
 
 
-def vtk_bytes(
-    X: np.ndarray, T: np.ndarray, scalars: dict[str, np.ndarray], title: str = ""
-) -> bytes:
+def vtk_bytes(X: Array, T: Array, scalars: dict[str, Array], title: str = "") -> bytes:
     """Make a binary legacy file; 3D Slicer reads ``SPACE=RAS`` or ``SPACE=LPS`` in its title."""
     cells = np.column_stack([np.full(len(T), 3), T]).astype(">i4")
     parts = [
@@ -186,9 +185,7 @@ def vtk_bytes(
 # XML files
 
 
-def vtp_bytes(
-    X: np.ndarray, T: np.ndarray, arrays: dict[str, np.ndarray], title: str = ""
-) -> bytes:
+def vtp_bytes(X: Array, T: Array, arrays: dict[str, Array], title: str = "") -> bytes:
     """Make an XML file with arrays in base64, and `title` in a comment.
 
     Parameters
@@ -225,7 +222,7 @@ def _data_array(name, values):
     width = values.shape[1] if values.ndim == 2 else 1
     raw = np.array(values.nbytes, "<u8").tobytes() + np.ascontiguousarray(values).tobytes()
     return (
-        f"<DataArray type={quoteattr(kind)} Name={quoteattr(name)} "
+        f'<DataArray type="{kind}" Name="{html.escape(name)}" '
         f'NumberOfComponents="{width}" format="binary">'
         f"{base64.b64encode(raw).decode()}</DataArray>\n"
     )
@@ -279,7 +276,7 @@ class VtkXml:
         self.size_type = np.dtype(self.order + ("u8" if is_64_bit else "u4"))
         self.compressor = self.root.get("compressor")
 
-    def values(self, node: Any) -> np.ndarray:
+    def values(self, node: Any) -> Array:
         """Read the numbers of a DataArray."""
         return self._bytes(node, _number_type(node.get("type"), self.order))
 
@@ -349,7 +346,7 @@ def _take(data, start, length, is_base64):
 
 
 # points, triangles (m, 3) or polygons, attributes
-Surface = tuple[np.ndarray, np.ndarray | Polygons, dict[str, str]]
+Surface = tuple[Array, Array | Polygons, dict[str, str]]
 
 
 @dataclass(frozen=True)
@@ -494,7 +491,7 @@ def _ply_tables(data):
     return table
 
 
-def ply_properties(data: bytes) -> dict[str, np.ndarray]:
+def ply_properties(data: bytes) -> dict[str, Array]:
     """Return the vertex properties of a PLY file by name.
 
     Raises
@@ -746,7 +743,7 @@ def _read_mni(data):
 # containers of arrays
 
 
-def gifti_arrays(data: bytes) -> list[tuple[str, np.ndarray]]:
+def gifti_arrays(data: bytes) -> list[tuple[str, Array]]:
     """Return the intent and the values of each array of a GIFTI file.
 
     Raises

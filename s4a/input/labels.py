@@ -17,10 +17,11 @@ import numpy as np
 from scipy import sparse
 
 from s4a.geometry.mesh import directed_edges
-from s4a.input.coordinates import AXES, UNKNOWN, CoordinateSystem, map_to_ras, nifti_system
+from s4a.input.coordinates import AXES, UNKNOWN, XFORMS, CoordinateSystem, map_to_ras
 from s4a.input.formats import PLY_TYPES
 from s4a.input.raw import check_there, content, gunzip, reading
 from s4a.options import MILLIMETRES, check_label
+from s4a.schema import Array
 
 VOLUMES = {".nii": "NIfTI", ".mgz": "MGH", ".mgh": "MGH", ".nrrd": "NRRD"}
 Label = int | str | Iterable[int] | None
@@ -41,7 +42,7 @@ def volume_format(data: bytes) -> str:
 
 def read_volume(
     path: str | os.PathLike[str], label: Label, *, iterations: int = ITERATIONS
-) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
+) -> tuple[Array, Array, dict[str, str]]:
     """Extract the surface of a label in world coordinates.
 
     Parameters
@@ -85,7 +86,7 @@ def read_volume(
     return smoothed(points, triangles, iterations), np.ascontiguousarray(triangles), attrs
 
 
-def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarray, np.ndarray]:
+def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[Array, Array]:
     """Mask ``(x, y, z)`` of the voxels with a label, and the affine map to millimetres.
 
     See :func:`read_volume`.
@@ -96,7 +97,7 @@ def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[np.ndarra
 
 def read_grid(
     path: str | os.PathLike[str],
-) -> tuple[tuple[int, ...], np.ndarray, CoordinateSystem]:
+) -> tuple[tuple[int, ...], Array, CoordinateSystem]:
     """Read the shape of a volume, of labels or grey values, its affine map, and its system.
 
     Raises
@@ -109,13 +110,15 @@ def read_grid(
         return grid_of(content(Path(path), _UNPACKED))
 
 
-def grid_of(data: bytes) -> tuple[tuple[int, ...], np.ndarray, CoordinateSystem]:
+def grid_of(data: bytes) -> tuple[tuple[int, ...], Array, CoordinateSystem]:
     """Return shape, affine map and coordinate system of a volume; see :func:`read_grid`."""
     kind, name = _kind_of(data := _as_nifti(data))
     header = kind.header_class.from_fileobj(io.BytesIO(data))
     affine, is_oriented = _affine_of(header, name)
     codes = [0, 2] if name == "MGH" else [int(header[f"{form}form_code"]) for form in "qs"]
-    system = nifti_system(codes[1] or codes[0]) if is_oriented else CoordinateSystem(unit="mm")
+    system = CoordinateSystem(unit="mm")
+    if is_oriented:
+        system = CoordinateSystem("RAS", XFORMS.get(codes[1] or codes[0], ""), "mm")
     if name == "MGH" and data[28:30] == b"\0\0":  # goodRASFlag: nibabel makes up directions
         system = replace(system, origin=UNKNOWN)
     return _shape_of(header), affine, system
@@ -296,7 +299,7 @@ def _boundary(inside):
     return points.astype(float) + origin, triangles.astype(np.int32), at_border
 
 
-def smoothed(X: np.ndarray, T: np.ndarray, iterations: int = ITERATIONS) -> np.ndarray:
+def smoothed(X: Array, T: Array, iterations: int = ITERATIONS) -> Array:
     """Smooth the points ``(n, 3)`` of a mesh by Taubin's method, which preserves the volume.
 
     Each step towards the mean of the neighbours is followed by a slightly larger step back.

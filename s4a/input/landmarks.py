@@ -13,7 +13,7 @@ from s4a.geometry.mesh import as_arrays, edge_graph, edges, triangle_areas
 from s4a.input.annotations import read_landmarks
 from s4a.input.coordinates import CoordinateSystem, file_system, moved, transform, with_system
 from s4a.input.raw import shown
-from s4a.schema import check_type, dataset, require
+from s4a.schema import Array, check_type, dataset, require
 
 log = logging.getLogger(__name__)
 
@@ -123,7 +123,7 @@ def locate(
 KNOWN, GIVEN = "the conversion", "the position as given"
 
 
-def possible_maps(landmarks: CoordinateSystem, mesh: xr.Dataset) -> dict[str, np.ndarray]:
+def possible_maps(landmarks: CoordinateSystem, mesh: xr.Dataset) -> dict[str, Array]:
     """Return the maps (4, 4) that can take landmarks to a mesh, by what they assume.
 
     There is one if both systems are known.  An unknown unit is that of the other.
@@ -165,8 +165,8 @@ def _located(surface_point, **variables):
 
 
 def follow(
-    P: np.ndarray, X: np.ndarray, T: np.ndarray, *, closed: bool = False, spacing: float
-) -> tuple[np.ndarray, np.ndarray]:
+    P: Array, X: Array, T: Array, *, closed: bool = False, spacing: float
+) -> tuple[Array, Array]:
     """Refine a polyline on a surface.
 
     Segments longer than `spacing` are halved repeatedly, and midpoints moved to the closest point

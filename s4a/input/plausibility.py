@@ -38,7 +38,7 @@ from s4a.input.chirality import (
     mean_chirality,
 )
 from s4a.input.subjects import listed as first_of
-from s4a.schema import dataset
+from s4a.schema import Array, dataset
 
 N_POINTS = 3000  # vertices of each shape that are used
 N_PAIRED = 300  # of them, those that ICP pairs
@@ -112,7 +112,7 @@ def describe(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
     )
 
 
-def hole_length(X: np.ndarray, boundary: np.ndarray) -> float:
+def hole_length(X: Array, boundary: Array) -> float:
     """Root of the sum of squared lengths of the loops of boundary edges ``(b, 2)``.
 
     One long loop, a missing part, counts more than many short ones, holes of a scan.
@@ -129,7 +129,7 @@ def hole_length(X: np.ndarray, boundary: np.ndarray) -> float:
     return float(np.linalg.norm(np.bincount(loop, length))) if len(boundary) else 0.0
 
 
-def lattice_step(X: np.ndarray) -> float:
+def lattice_step(X: Array) -> float:
     """Step of the lattice that coordinates are rounded to, the least of the axes; 0 if none.
 
     Examples
@@ -156,7 +156,7 @@ def _log_measures(descriptors):
     return np.log(np.maximum(rows, 1e-300)).reshape(-1, 5)
 
 
-def excess(values: np.ndarray, least: float | np.ndarray) -> np.ndarray:
+def excess(values: Array, least: float | Array) -> Array:
     """Leave-one-out robust z-score: distance from the median of the other values, in deviations.
 
     The deviation is 1.48 times the median absolute deviation, increased if there are few values,
@@ -292,10 +292,10 @@ class View:
 
     cloud: Cloud
     rough: Cloud  # pairs fewer of its vertices
-    normal: np.ndarray  # (n, 3)
+    normal: Array  # (n, 3)
 
 
-def view(descriptor: xr.Dataset, flip: np.ndarray | float = 1.0) -> View:
+def view(descriptor: xr.Dataset, flip: Array | float = 1.0) -> View:
     """Prepare a descriptor, or with ``flip=MIRROR`` its mirror image, for ``_best_pose``."""
     X, area = descriptor["descriptor_position"].values * flip, descriptor["descriptor_area"].values
     fine = cloud(X, area, N_PAIRED)
@@ -549,7 +549,9 @@ def _genus(attrs, remarks):
     count = Counter(genus.values())
     if len(count) < 2:
         return
-    remarks.append(f"the shapes differ in genus ({_names_by(genus, 'genus ')})")
+    names = {g: first_of([n for n in genus if genus[n] == g], most=6) for g in sorted(count)}
+    listed = "; ".join(f"genus {g}: {of_genus}" for g, of_genus in names.items())
+    remarks.append(f"the shapes differ in genus ({listed})")
     usual, number = count.most_common(1)[0]
     for name, g in genus.items():
         if g != usual and number > len(genus) / 2:
@@ -634,12 +636,6 @@ def _forms(comparisons, flags):
         is_explained = any(flag.kind in ("partial", "duplicate") for flag in flags[name])
         if deviations > WARNED and not is_explained:
             yield name, flag("kind", deviations > FLAGGED, what=what, deviations=deviations)
-
-
-def _names_by(values, prefix=""):
-    """Shapes of each value: ``m: a; mm: b, c``."""
-    groups = {v: [name for name in values if values[name] == v] for v in set(values.values())}
-    return "; ".join(f"{prefix}{v}: {first_of(groups[v], most=6)}" for v in sorted(groups))
 
 
 class Decision(NamedTuple):

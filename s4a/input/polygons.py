@@ -6,14 +6,16 @@ and the number of corners of each.
 
 import numpy as np
 
-Polygons = tuple[np.ndarray, np.ndarray]
+from s4a.schema import Array
+
+Polygons = tuple[Array, Array]
 _FLAT = 1e-6  # largest distance of corners from the plane of a planar polygon, in its extents
 _NEGATIVE = 1e-7  # largest share of the area of a triangle that may be folded over, by rounding
 _EPSILON = 1e-12  # area of a triangle that is not distinguished from 0, for extents of 1
 _MOST = 20_000  # corners of a concave polygon, as ear clipping takes the square of their number
 
 
-def polygons(corners: np.ndarray, offsets: np.ndarray) -> Polygons:
+def polygons(corners: Array, offsets: Array) -> Polygons:
     """Return polygons by their sizes, given by offsets ``(p + 1,)`` into their corners ``(c,)``.
 
     Raises
@@ -36,7 +38,7 @@ def joined(parts: list[Polygons]) -> Polygons:
     return np.concatenate(corners), np.concatenate(sizes)
 
 
-def strips(corners: np.ndarray, sizes: np.ndarray) -> Polygons:
+def strips(corners: Array, sizes: Array) -> Polygons:
     """Return the triangles of triangle strips; every second triangle of a strip is reversed.
 
     Examples
@@ -58,7 +60,7 @@ def strips(corners: np.ndarray, sizes: np.ndarray) -> Polygons:
     return corners[triangles].ravel(), np.full(len(triangles), 3)
 
 
-def triangulated(X: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, int]:
+def triangulated(X: Array, corners: Array, sizes: Array) -> tuple[Array, int]:
     """Triangulate polygons; those of fewer than three corners give no triangle.
 
     A planar polygon becomes the triangle fan of its first corner, unless a triangle is folded over.

@@ -115,6 +115,13 @@ def read_bytes(path: _AnyPath) -> bytes:
         return read_all(file)
 
 
+def new_folder(path: _AnyPath) -> Path:
+    """Return a folder, which is made if it is missing."""
+    folder = Path(path)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 def shown(text: object) -> str:
     r"""Escape unprintable characters of a path or a text.
 
@@ -261,20 +268,13 @@ def unpack(data: bytes, compressor: str, limit: int) -> bytes:
     """Unpack one stream of ``"zlib"`` or ``"lzma"``, at most `limit` bytes."""
     by_lzma = compressor == "lzma"
     stream: Any = lzma.LZMADecompressor(memlimit=2**28) if by_lzma else zlib.decompressobj()
-    unpacked = io.BytesIO()
-    step = 2**16  # packed bytes at a time
-    for start in range(0, len(data), step):
-        part, packed = b"", data[start : start + step]
-        while packed or len(part) == CHUNK:  # there may be more output
-            part = stream.decompress(packed, CHUNK)
-            packed = b"" if by_lzma else stream.unconsumed_tail
-            unpacked.write(part)
-            most = min(limit, limit_of(min(start + step, len(data))))
-            if unpacked.tell() > most:
-                raise ValueError(f"at most {most} bytes expected in a compressed block, found more")
-            if stream.eof:
-                return unpacked.getvalue()
-    raise ValueError(f"a compressed block is truncated: found {len(data)} bytes")
+    most = min(limit, limit_of(len(data)))
+    unpacked = stream.decompress(data, most + 1)
+    if len(unpacked) > most:
+        raise ValueError(f"at most {most} bytes expected in a compressed block, found more")
+    if not stream.eof:
+        raise ValueError(f"a compressed block is truncated: found {len(data)} bytes")
+    return unpacked
 
 
 def xml(text: bytes | str) -> ElementTree.Element:

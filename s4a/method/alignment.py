@@ -48,8 +48,8 @@ IDENTITY = np.eye(3), np.zeros(3)
 class Alignment(NamedTuple):
     """Rigid transform of a shape onto a reference, and equally good poses."""
 
-    R: np.ndarray  # (3, 3)
-    t: np.ndarray  # (3,)
+    R: Array  # (3, 3)
+    t: Array  # (3,)
     fits: tuple[float, ...] = (0.0,)  # residuals of equally good poses, the least first
     angle: float = 0.0  # degrees between the first and the second of them
 

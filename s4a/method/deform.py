@@ -15,6 +15,8 @@ from s4a.geometry.mesh import triangle_areas
 from s4a.method.spectral import project
 from s4a.schema import Array
 
+_TIME = 3.0  # of the heat kernel of rigid parts, times the last eigenvalue
+
 
 def smoother(Phi: Array, area: Array, U: sp.spmatrix | None = None) -> Callable[..., Any]:
     """Return the A-orthogonal projection d -> (B^T A B)^-1 B^T A d onto B = U Phi.
@@ -79,13 +81,7 @@ def onto(
 
 
 def rigid_parts(
-    X: Array,
-    image: Array,
-    mass: Array | sp.spmatrix,
-    Phi: Array,
-    eigenvalue: Array,
-    *,
-    time: float = 3.0,
+    X: Array, image: Array, mass: Array | sp.spmatrix, Phi: Array, eigenvalue: Array
 ) -> tuple[Array, Array]:
     """Fit a rigid transform around every vertex: a smooth, piecewise rigid transform.
 
@@ -99,8 +95,6 @@ def rigid_parts(
         Mass matrix in which Phi is orthonormal.
     Phi, eigenvalue : float ndarray (n, K), (K,)
         Orthonormal eigenfunctions.  If all eigenvalues are 0, each component moves rigidly.
-    time : float
-        Time of the heat kernel, times the last eigenvalue.
 
     Returns
     -------
@@ -109,7 +103,7 @@ def rigid_parts(
         The transforms R x + t.
     """
     largest = max(eigenvalue[-1], np.finfo(float).tiny)
-    heat = np.exp(-time * eigenvalue / largest)[:, None]  # (K, 1)
+    heat = np.exp(-_TIME * eigenvalue / largest)[:, None]  # (K, 1)
 
     def around(f):
         """Mean of a function around every vertex, weighted by the heat kernel."""

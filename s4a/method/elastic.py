@@ -226,12 +226,6 @@ def normal_equations(
     return matrix, right.T.ravel()
 
 
-def _sampled_area(target, samples):
-    """Area ``(s,)`` of the vertices nearest to each of some samples of a surface."""
-    nearest = cKDTree(target.X[samples]).query(target.X)[1]
-    return np.bincount(nearest, target.area, len(samples))
-
-
 def _decorrelation(E, area):
     """B ``(q, q)`` such that E B has the initial positions orthogonal to the smooth functions.
 
@@ -319,7 +313,10 @@ def elastic_iterations(
     bending[: smooth.shape[1], 0] = target.eigenvalue[1:] ** 2
     X = E @ w
     energies: list[float] = []  # of bending, after each step
-    area = target.area if isinstance(vertices, slice) else _sampled_area(target, vertices)
+    area = target.area
+    if not isinstance(vertices, slice):  # of the vertices nearest to each sample
+        nearest = cKDTree(target.X[vertices]).query(target.X)[1]
+        area = np.bincount(nearest, target.area, len(vertices))
     F = E_B[vertices]
     mass = F.T @ (area[:, None] * F)
     n_fixed = len(schedule.stiffness) - schedule.further

@@ -70,28 +70,26 @@ def wave_filter(eigenvalue: Array, *others: Array, n: int = 100) -> Array:
     return kernel / kernel.sum(axis=1, keepdims=True)
 
 
-def signature(Phi: Array, kernel: Array) -> Array:
+def signature(Phi: Array, kernel: Array, landmark: Array | None = None) -> Array:
     """Return the signature of every vertex ``(n, f)``: squared eigenfunctions times f filters.
 
     It does not depend on the signs of the eigenfunctions, and cannot distinguish the sides of a
-    symmetric shape.
+    symmetric shape.  Signatures around p landmarks ``(n, p f)`` distinguish them.
 
     Parameters
     ----------
     Phi : float ndarray (n, k)
     kernel : float ndarray (f, k)
+    landmark : int ndarray (p,), optional
     """
-    return Phi**2 @ kernel.T
+    if landmark is None:
+        return Phi**2 @ kernel.T
+    return Phi @ landmark_coefficients(Phi, kernel, landmark)
 
 
 def landmark_coefficients(Phi: Array, kernel: Array, landmark: Array) -> Array:
     """Return the coefficients ``(k, p f)`` of the signatures around p vertices with f filters."""
     return np.einsum("fk,pk->kpf", kernel, Phi[landmark]).reshape(Phi.shape[1], -1)
-
-
-def landmark_signature(Phi: Array, kernel: Array, landmark: Array) -> Array:
-    """Return signatures around p vertices ``(n, p f)``, which distinguish symmetric sides."""
-    return Phi @ landmark_coefficients(Phi, kernel, landmark)
 
 
 def hks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None = None) -> Array:
@@ -127,8 +125,7 @@ def hks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None =
     >>> hks(Phi, np.array([0.0, 9.0]), n=2, landmark=[0]).shape
     (2, 2)
     """
-    kernel = heat_filter(eigenvalue, n=n)
-    return signature(Phi, kernel) if landmark is None else landmark_signature(Phi, kernel, landmark)
+    return signature(Phi, heat_filter(eigenvalue, n=n), landmark)
 
 
 def wks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None = None) -> Array:
@@ -152,8 +149,7 @@ def wks(Phi: Array, eigenvalue: Array, *, n: int = 100, landmark: Array | None =
     Aubry, M., Schlickewei, U. and Cremers, D. (2011). The wave kernel signature: a quantum
     mechanical approach to shape analysis. ICCV Workshops.
     """
-    kernel = wave_filter(eigenvalue, n=n)
-    return signature(Phi, kernel) if landmark is None else landmark_signature(Phi, kernel, landmark)
+    return signature(Phi, wave_filter(eigenvalue, n=n), landmark)
 
 
 def mean_curvature(X: Array, normals: Array, area: Array, Phi: Array, eigenvalue: Array) -> Array:
@@ -430,16 +426,11 @@ def _constant_to_constant(source, target):
 
 
 def fmap_from_landmarks(
-    source: Basis,
-    target: Basis,
-    landmark_source: Array,
-    landmark_target: Array,
-    *,
-    commute: float = LAPLACIAN,
+    source: Basis, target: Basis, landmark_source: Array, landmark_target: Array
 ) -> Array:
     """Fit a functional map to heat kernels around landmark pairs (step 4 of 4.1).
 
-    :func:`fit` with the :func:`landmark_descriptors` and the penalty commute |F|^2 (mu_i -
+    :func:`fit` with the :func:`landmark_descriptors` and the penalty 0.001 |F|^2 (mu_i -
     lambda_j)^2 / lambda_max^2.
 
     Parameters
@@ -454,25 +445,17 @@ def fmap_from_landmarks(
     C : float ndarray (k, k)
     """
     F, G = landmark_descriptors(source, target, landmark_source, landmark_target)
-    return fit_to_landmarks(source, target, F, G, commute=commute)
+    return fit_to_landmarks(source, target, F, G)
 
 
-def fit_to_landmarks(
-    source: Basis, target: Basis, F: Array, G: Array, *, commute: float = LAPLACIAN
-) -> Array:
+def fit_to_landmarks(source: Basis, target: Basis, F: Array, G: Array) -> Array:
     """Fit a functional map ``(k, k)`` to the :func:`landmark_descriptors` F and G."""
-    penalty = commute * np.trace(F @ F.T) * _commutator(source.eigenvalue, target.eigenvalue)
+    penalty = LAPLACIAN * np.trace(F @ F.T) * _commutator(source.eigenvalue, target.eigenvalue)
     return fit(F, G, penalty=penalty, constant=_constant_to_constant(source, target))
 
 
 def fmap_from_wave_kernels(
-    source: Basis,
-    target: Basis,
-    landmark_source: Array,
-    landmark_target: Array,
-    *,
-    k: int = 20,
-    weights: tuple[float, float, float] = (1.0, 1e-2, 1e-1),
+    source: Basis, target: Basis, landmark_source: Array, landmark_target: Array, *, k: int = 20
 ) -> Array:
     """Fit a functional map ``(k, k)`` to wave kernels as pyFM 1.3.1 does.
 
@@ -487,15 +470,13 @@ def fmap_from_wave_kernels(
         With all eigenfunctions.
     landmark_source, landmark_target : int ndarray (p,)
         Corresponding vertices.
-    weights : tuple of float
-        Weights of the three terms; only their ratios matter.
     """
     F, operators, spectra = [], [], []
     n = min(source.k, target.k)
     for shape, landmark in ((source, landmark_source), (target, landmark_target)):
         kernel = wave_filter(shape.eigenvalue[:n])[::EVERY]
         Phi = shape.Phi[:, :n]
-        f = np.column_stack([signature(Phi, kernel), landmark_signature(Phi, kernel, landmark)])
+        f = np.column_stack([signature(Phi, kernel), signature(Phi, kernel, landmark)])
         f /= np.sqrt(shape.area @ f**2)
         F.append(Phi[:, :k].T @ (shape.area[:, None] * f))  # (k, d)
         operators.append(multiplication(Phi[:, :k], shape.area, f))  # (d, k, k)
@@ -512,7 +493,7 @@ def fmap_from_wave_kernels(
         mask.mean() * k,
         (squares - 2 * (traces[0] @ traces[1]) / k) / n_independent,
     )
-    w_descriptor, w_laplacian, w_operator = np.divide(weights, scales)
+    w_descriptor, w_laplacian, w_operator = np.divide((1.0, 1e-2, 1e-1), scales)
     root_w = np.sqrt(w_descriptor)
     constant = _constant_to_constant(source, target)
     operator = [(w_operator, *operators)]
@@ -587,7 +568,7 @@ def fmap_from_descriptors(
         kernel = np.concatenate([values[::EVERY] for values in filters])
         descriptors = [signature(shape.Phi, kernel)]  # (n, d)
         if landmark is not None:
-            descriptors.append(landmark_signature(shape.Phi, kernel, landmark))
+            descriptors.append(signature(shape.Phi, kernel, landmark))
         descriptors += [shape.fields[name] for name in common_fields(source, target)]
         f = np.column_stack([*descriptors, *(curvatures(shape) if curvature else [])])
         f = f - shape.area @ f
@@ -629,14 +610,8 @@ def curvature_difference(source: Basis, target: Basis, match: Array) -> float:
 
 def curvatures(basis: Basis) -> list[Array]:
     """Return signed mean curvatures ``(n,)`` for the numbers of functions :data:`SCALES`."""
-    X, normals, area, Phi, eigenvalue = (
-        basis.X,
-        basis.normals,
-        basis.area,
-        basis.Phi,
-        basis.eigenvalue,
-    )
-    return [mean_curvature(X, normals, area, Phi[:, :k], eigenvalue[:k]) for k in SCALES]
+    surface = basis.X, basis.normals, basis.area
+    return [mean_curvature(*surface, basis.Phi[:, :k], basis.eigenvalue[:k]) for k in SCALES]
 
 
 def orthogonality_error(C: Array) -> float:

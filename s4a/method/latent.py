@@ -48,6 +48,7 @@ TARGETS = 256  # shapes whose least-squares factors are in memory at once, 0.3 G
 DENSE_ITERATIONS = 4  # final iterations of Consistent ZoomOut that also search between the samples
 N_AROUND = 32  # vertices around a sample that they search
 ROUGH, FINE = 1e-4, 1e-6  # tolerances of the latent basis: intermediate and final
+MOST_ITERATIONS = 100  # for the latent basis
 
 _Form = Callable[[Array], Array]  # the product of a quadratic form with vectors
 
@@ -147,9 +148,7 @@ def _spanning_tree_bases(C, source, target, n):
     return Y
 
 
-def smallest_eigenvectors(
-    apply: _Form, guess: Array, *, tolerance: float = FINE, max_iterations: int = 100
-) -> Array:
+def smallest_eigenvectors(apply: _Form, guess: Array, *, tolerance: float = FINE) -> Array:
     """Return the eigenvectors of the smallest eigenvalues of a semi-definite form ``(n, m)``.
 
     Chebyshev-filtered subspace iteration (Zhou, Saad, Tiago, Chelikowsky 2006): each iteration
@@ -165,7 +164,6 @@ def smallest_eigenvectors(
         Initial vectors, close to the eigenvectors if possible.
     tolerance : float
         Largest residual of a vector, as a share of the largest eigenvalue.
-    max_iterations : int
     """
     n, m = guess.shape
     n_spare = min(n - m, max(4, m // 10))  # the last vectors of a subspace converge slowest
@@ -174,7 +172,7 @@ def smallest_eigenvectors(
     form = LinearOperator((n, n), lambda v: apply(v.reshape(n, 1)).ravel(), dtype=float)
     largest = eigsh(form, 1, which="LA", tol=1e-2, v0=spare[:, 0], return_eigenvectors=False)[0]
     top = 1.02 * largest  # above all eigenvalues, though `largest` is 1 % uncertain
-    for _ in range(max_iterations):
+    for _ in range(MOST_ITERATIONS):
         LV = apply(V)
         ritz, R = np.linalg.eigh(V.T @ LV)
         V = V @ R
@@ -182,7 +180,7 @@ def smallest_eigenvectors(
         if residual.max() <= tolerance * top:
             return V[:, :m]
         V = np.linalg.qr(_chebyshev_filter(apply, V, ritz[0], ritz[-1], top))[0]
-    log.warning("the latent basis reached %d iterations before its tolerance", max_iterations)
+    log.warning("the latent basis reached %d iterations before its tolerance", MOST_ITERATIONS)
     return V[:, :m]
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.method.pca import gram_pca
-from s4a.schema import Array, dataset, require
+from s4a.schema import Array, check_choice, dataset, require
 
 # |(Lambda^0)^a (D - I) (Lambda^0)^-b|_F: powers a and b of each interpretation of the norm of eq. 5
 NORMS = {
@@ -75,8 +75,7 @@ def distance_to_identity(D: Array, latent_eigenvalue: Array, norm: str = "h2") -
     itself, |Lambda^0 (D - I) (Lambda^0)^+|_F.  Constant functions, one per component of the
     surface, are excluded.
     """
-    if norm not in NORMS:
-        raise ValueError(f"norm must be one of {', '.join(NORMS)}; found {norm!r}")
+    check_choice("norm", norm, NORMS)
     power_image, power_argument = NORMS[norm]
     weighted = (D - np.eye(D.shape[1])) * inverse(latent_eigenvalue, power_argument)  # (n, m, m)
     weighted = inverse(latent_eigenvalue, -power_image)[:, None] * weighted

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from joblib import effective_n_jobs
-from scipy.optimize import linprog
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra, shortest_path
 
@@ -210,6 +209,8 @@ def program_errors(C: Array, cycles: Array) -> Array:
             C[c] @ C[b] @ C[a] for a, b, c in (np.roll(cycles[part].T, i, axis=0) for i in range(3))
         ]
         deviation[part] = np.linalg.norm(np.array(products) - identity, axis=(2, 3)).max(0)
+    from scipy.optimize import linprog  # a tenth of a second, and rarely used
+
     rows = np.repeat(np.arange(len(cycles)), 3)
     A = csr_array((np.ones(cycles.size), (rows, cycles.ravel())), shape=(len(cycles), len(C)))
     total = A.T @ deviation  # (p,)

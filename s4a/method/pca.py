@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy.linalg import eigh
 
 from s4a.geometry.mesh import vertex_normals
 from s4a.method.deform import normal_displacement, smoother
@@ -91,7 +92,7 @@ def parts(fields: Array | xr.Variable) -> Iterator[tuple[slice, Array]]:
 
 def center_gram(K: Array) -> Array:
     """Centre a Gram matrix ``(s, s)``, as if the mean were subtracted from the fields."""
-    return K - K.mean(0) - K.mean(1)[:, None] + K.mean()
+    return K - K.mean(0) - K.mean(1)[:, None] + K.mean(0).mean()
 
 
 def principal_components(K: Array) -> tuple[Array, Array]:
@@ -102,12 +103,13 @@ def principal_components(K: Array) -> tuple[Array, Array]:
 
     See Also
     --------
-    sklearn.decomposition.KernelPCA : The implementation.
+    sklearn.decomposition.KernelPCA : The same; its import takes longer than a small analysis.
     """
-    from sklearn.decomposition import KernelPCA  # here, as the import takes 0.2 s
-
-    fitted = KernelPCA(kernel="precomputed", eigen_solver="dense").fit(K)
-    return fitted.eigenvalues_ / (len(K) - 1), fitted.eigenvectors_
+    values, vectors = eigh(center_gram(K))
+    order = np.flatnonzero(values > 1e-12 * values[-1])[::-1]
+    V = vectors[:, order]
+    V *= np.sign(V[np.abs(V).argmax(0), np.arange(len(order))])  # eigenvectors have no sign
+    return values[order] / (len(K) - 1), V
 
 
 def gram_pca(fields: Array | xr.Variable, area: Array) -> _PrincipalModes:
@@ -360,18 +362,16 @@ def plausible_scores(n: int, *, seed: int | None = None, limit: float = 3.0) -> 
     return scores
 
 
-def color_limits(
-    mean: Array, triangles: Array, deformation: Array, *, sigma: float = 3, n_modes: int = 3
-) -> tuple[float, float]:
-    """Return the colour limits of displacements: along the normal, and in length.
+def color_limits(mean: Array, triangles: Array, deformation: Array) -> tuple[float, float]:
+    """Return the colour limits of displacements ``(c, n, 3)``: along the normal, and in length.
 
-    The 95 % quantile over vertices and the first modes at `sigma` standard deviations, which is one
-    scale for all modes and robust to outlying vertices.
+    The 95 % quantile over vertices and modes at 3 standard deviations, which is one scale for all
+    modes and robust to outlying vertices.
     """
-    steps = deformation[:n_modes]  # (c, n, 3)
-    along = np.quantile(np.abs(normal_displacement(steps, vertex_normals(mean, triangles))), 0.95)
-    length = np.quantile(np.linalg.norm(steps, axis=2), 0.95)
-    return float(sigma * along) or 1.0, float(sigma * length) or 1.0
+    along = normal_displacement(deformation, vertex_normals(mean, triangles))
+    sizes = np.abs(along), np.linalg.norm(deformation, axis=2)
+    limit, limit_length = (float(3 * np.quantile(size, 0.95)) or 1.0 for size in sizes)
+    return limit, limit_length
 
 
 def project_scores(

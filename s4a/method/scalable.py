@@ -13,7 +13,6 @@ import logging
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 import xarray as xr
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
@@ -23,7 +22,7 @@ from s4a.geometry.mesh import as_arrays, edge_graph, stiffness, unique_edges, ve
 from s4a.geometry.voronoi import add_samples, dual, farthest_of_each, voronoi_cells
 from s4a.method.remesh import check_clean, laplacian, sample_surface
 from s4a.method.shape import Basis, Shape
-from s4a.method.spectral import factor, with_constant_first
+from s4a.method.spectral import canonical, nearest_eigenpairs, solved
 from s4a.schema import Array, check_count, dataset, in_unit, require, unit_of
 
 log = logging.getLogger(__name__)
@@ -125,17 +124,8 @@ def _reduced_eigenpairs(U, W, area, k):
     stiff, mass = (U.T @ W @ U).tocsc(), (U.T @ sp.diags(area) @ U).tocsc()
     # keeps the factor away from the constants
     shift = 1e-6 * stiff.diagonal().sum() / mass.diagonal().sum()
-    inverse = spla.LinearOperator(stiff.shape, matvec=factor(stiff + shift * mass), dtype=float)
-    v0 = 1 + 1e-3 * np.cos(np.arange(U.shape[1]))
-    eigenvalue, Phi = spla.eigsh(stiff, k=k, M=mass, sigma=-shift, OPinv=inverse, v0=v0, which="LM")
-    order = np.argsort(eigenvalue)
-    eigenvalue, Phi = eigenvalue[order], Phi[:, order]
-    zero = np.abs(eigenvalue) < 1e-9 * max(eigenvalue[-1], 1.0)
-    eigenvalue = np.where(zero, 0.0, eigenvalue)  # else heat kernels would use rounding errors
-    Phi[:, zero] = with_constant_first(Phi[:, zero], U.T @ area)
-    Phi = Phi * np.where(area @ (U @ Phi) ** 3 < 0, -1.0, 1.0)
-    if zero.any():
-        Phi[:, 0] = 1.0  # exactly, as in eigenpairs
+    pairs = nearest_eigenpairs(stiff, k, -shift, 1.0, mass)
+    eigenvalue, Phi = canonical(*pairs, U.T @ area, lambda Phi: area @ (U @ Phi) ** 3)
     return eigenvalue, Phi, mass.tocsr()
 
 
@@ -195,10 +185,7 @@ def spectral_space(
     mesh: xr.Dataset, sample: Array, cell: Array, U: sp.csr_matrix, k: int = 100
 ) -> Shape:
     """Compute the eigenpairs in the span of U: the second half of :func:`reduce`."""
-    if not 1 <= k < len(sample):
-        raise ValueError(
-            f"k must be from 1 to below the number of samples, {len(sample)}; found {k!r}"
-        )
+    check_count("k", k, 1, len(sample) - 1)
     X, T = as_arrays(mesh)
     X = Shape(mesh).to_frame(X)
     E, w, area, _ = laplacian(X, T, vertex_areas(X, T))
@@ -258,22 +245,15 @@ def reduced(mesh: xr.Dataset, *, n_coarse: int = 6000, k: int = 100, seed: int =
     """
     require(mesh, "position", "corner_vertex", what="mesh")
     check_count("n_coarse", n_coarse, 4)
-    check_count("k", k, 1)
     X, T = as_arrays(mesh)
     check_clean(X, T)
     sample, cell, U = local_space(mesh, n_coarse, seed)
     p = len(sample)
-    k_possible = min(int(k), p - 2)
-    if k_possible < 1:
-        raise ValueError(f"a spectrum needs at least 3 samples; found {p}")
     E, w, area, kind = laplacian(X, T, vertex_areas(X, T))
     total, W = area.sum(), stiffness(E, w, len(X))
-    if not np.isfinite(w).all():
-        raise ValueError("cotan weights must be finite; some triangles are too thin")
-    try:
-        eigenvalue, Phi, mass = _reduced_eigenpairs(U, W, area / total, k_possible)
-    except RuntimeError as error:  # of the factor or of ARPACK
-        raise ValueError(f"no {k_possible} eigenpairs of {p} local functions: {error}") from error
+    (eigenvalue, Phi, mass), found = solved(
+        lambda k: _reduced_eigenpairs(U, W, area / total, k), k, w, p, "samples"
+    )
     attrs: dict[str, int | str] = {
         "method": "scalable",
         "n_coarse": int(n_coarse),
@@ -281,11 +261,8 @@ def reduced(mesh: xr.Dataset, *, n_coarse: int = 6000, k: int = 100, seed: int =
         "wrapped": 0,
         "kept_whole": int(p == len(X)),
         "laplacian": kind,
-        "zero_eigenvalues": int((eigenvalue == 0).sum()),
+        **found,
     }
-    if k_possible < k:
-        log.warning("k reduced from %d to %d: the mesh has only %d samples", k, k_possible, p)
-        attrs["k_reduced_from"] = int(k)
     stiff = sp.csr_matrix(U.T @ W @ U)
     i, j = sp.triu(abs(stiff) + abs(mass), 1).nonzero()
     entries = U.tocoo()

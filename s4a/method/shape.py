@@ -148,16 +148,14 @@ class Basis:
 
     def guided_tree(self, names: tuple[str, ...]) -> cKDTree:
         """Return the KD-tree over position, normal and some fields, 6 dims and one for each."""
-        if not names:
-            return self.tree
-        if names not in self._guided:
+        if names not in self._trees:
             rows = np.concatenate([self.tree.data, field_columns(self, names)], axis=1)
-            self._guided[names] = tree_over(rows)
-        return self._guided[names]
+            self._trees[names] = tree_over(rows)
+        return self._trees[names]
 
     @cached_property
-    def _guided(self) -> dict[tuple[str, ...], cKDTree]:
-        return {}
+    def _trees(self) -> dict[tuple[str, ...], cKDTree]:
+        return {(): self.tree}
 
     @cached_property
     def normals(self) -> Array:

@@ -45,19 +45,66 @@ def eigenpairs(E: Array, w: Array, area: Array, k: int) -> tuple[Array, Array]:
     root = sp.diags(1 / np.sqrt(a))
     S = (root @ stiffness(E, w, n) @ root).tocsc()  # (n, n)
     shift = 1e-8 * S.diagonal().mean()  # keeps the factor away from the null space
-    inverse = spla.LinearOperator((n, n), matvec=factor(S + shift * sp.identity(n)), dtype=float)
-    v0 = np.sqrt(a) + 1e-3 * np.cos(np.arange(n))  # the default of ARPACK is random
-    eigenvalue, V = spla.eigsh(S, k=k, sigma=-shift, OPinv=inverse, v0=v0, which="LM")
+    eigenvalue, V = nearest_eigenpairs(S, k, -shift, np.sqrt(a))
+    # a power takes 30 times as long
+    return canonical(eigenvalue, V / np.sqrt(a)[:, None], a, lambda Phi: a @ (Phi * Phi * Phi))
+
+
+def nearest_eigenpairs(
+    S: sp.spmatrix, k: int, sigma: float, v0: Array | float, M: sp.spmatrix | None = None
+) -> tuple[Array, Array]:
+    """Return the k eigenpairs of S v = lambda M v nearest to sigma, in ascending order."""
+    n = S.shape[0]
+    inverse = factor(S - sigma * (sp.identity(n) if M is None else M))
+    operator = spla.LinearOperator((n, n), matvec=inverse, dtype=float)
+    v0 = v0 + 1e-3 * np.cos(np.arange(n))  # the default of ARPACK is random
+    eigenvalue, V = spla.eigsh(S, k=k, M=M, sigma=sigma, OPinv=operator, v0=v0, which="LM")
     order = np.argsort(eigenvalue)
-    eigenvalue = eigenvalue[order]
-    Phi = V[:, order] / np.sqrt(a)[:, None]  # (n, k)
+    return eigenvalue[order], V[:, order]
+
+
+def canonical(
+    eigenvalue: Array, Phi: Array, area: Array, third_moment: Callable[[Array], Array]
+) -> tuple[Array, Array]:
+    """Return ascending eigenpairs with exact zeros, the constant 1 first, and the signs chosen."""
+    # else heat kernels would use rounding errors
     eigenvalue = np.where(np.abs(eigenvalue) < 1e-9 * max(eigenvalue[-1], 1.0), 0.0, eigenvalue)
     zero = eigenvalue == 0
-    Phi[:, zero] = with_constant_first(Phi[:, zero], a)
-    Phi *= np.where(a @ (Phi * Phi * Phi) < 0, -1.0, 1.0)  # a power takes 30 times as long
+    Phi[:, zero] = with_constant_first(Phi[:, zero], area)
+    Phi *= np.where(third_moment(Phi) < 0, -1.0, 1.0)
     if zero.any():
         Phi[:, 0] = 1.0  # exactly, so that constants stay constant in every map
     return eigenvalue, Phi
+
+
+def solved(
+    solve: Callable[[int], tuple[Array, ...]], k: int, w: Array, n: int, what: str
+) -> tuple[tuple[Array, ...], dict[str, int]]:
+    """Return the result of `solve`, eigenvalues first, for k pairs or as many as there are.
+
+    Also the attributes ``zero_eigenvalues`` and, if k is reduced, ``k_reduced_from``.
+
+    Raises
+    ------
+    ValueError
+        If k is not a positive integer, the mesh has fewer than 3 of `what`, a weight w is not
+        finite, or the solver does not converge.
+    """
+    check_count("k", k, 1)
+    k_possible = min(int(k), n - 2)
+    if k_possible < 1:
+        raise ValueError(f"a spectrum needs at least 3 {what}; found {n}")
+    if not np.isfinite(w).all():
+        raise ValueError("cotan weights must be finite; some triangles are too thin")
+    try:
+        eigenvalue, *others = solve(k_possible)
+    except RuntimeError as error:  # of the factor or of ARPACK
+        raise ValueError(f"no {k_possible} eigenpairs of {n} {what}: {error}") from error
+    attrs = {"zero_eigenvalues": int((eigenvalue == 0).sum())}
+    if k_possible < k:
+        log.warning("k reduced from %d to %d: the mesh has only %d %s", k, k_possible, n, what)
+        attrs["k_reduced_from"] = int(k)
+    return (eigenvalue, *others), attrs
 
 
 def with_constant_first(Z: Array, area: Array) -> Array:
@@ -194,32 +241,19 @@ def spectrum(mesh: xr.Dataset, *, k: int = 100) -> xr.Dataset:
     <TiledFigure ...>
     """
     require(mesh, "vertex_area", "edge_vertex", "cotan_weight", what="mesh")
-    check_count("k", k, 1)
     if "edge_mass" in mesh:
         raise ValueError(
             "a low-resolution mesh of s4a.coarsen is needed; samples of SCALABLE have a "
             "spectrum: compute them again with another k"
         )
-    n = mesh.sizes["vertex"]
-    k_possible = min(int(k), n - 2)
-    if k_possible < 1:
-        raise ValueError(f"a spectrum needs at least 3 vertices; found {n}")
-    E, w = mesh["edge_vertex"].values, mesh["cotan_weight"].values
-    if not np.isfinite(w).all():
-        raise ValueError("cotan weights must be finite; some triangles are too thin")
-    try:
-        eigenvalue, Phi = eigenpairs(E, w, mesh["vertex_area"].values, k_possible)
-    except RuntimeError as error:  # of the factor or of ARPACK
-        raise ValueError(
-            f"no {k_possible} eigenpairs of a mesh with {n} vertices: {error}"
-        ) from error
+    E, w, area = (mesh[name].values for name in ("edge_vertex", "cotan_weight", "vertex_area"))
+    (eigenvalue, Phi), found = solved(
+        lambda k: eigenpairs(E, w, area, k), k, w, len(area), "vertices"
+    )
     mesh = mesh.drop_dims("eigenpair", errors="ignore")  # of an earlier spectrum
     mesh.attrs.pop("k_reduced_from", None)
-    attrs = dict(mesh.attrs, zero_eigenvalues=int((eigenvalue == 0).sum()))
-    if k_possible < k:
-        log.warning("k reduced from %d to %d: the mesh has only %d vertices", k, k_possible, n)
-        attrs["k_reduced_from"] = int(k)
-    return xr.merge([mesh, dataset(eigenvalue=eigenvalue, eigenfunction=Phi)]).assign_attrs(attrs)
+    spectrum = dataset(eigenvalue=eigenvalue, eigenfunction=Phi)
+    return xr.merge([mesh, spectrum]).assign_attrs(mesh.attrs | found)
 
 
 def unit_area(mesh: xr.Dataset) -> Array:

@@ -25,6 +25,8 @@ from s4a.method.spectral import project
 from s4a.schema import Array
 
 POSE_DISTANCE = 0.035  # 90 % quantile of distances above which poses differ, see `poses_differ`
+N_TRIPS, LONGEST_TRIP = 300, 0.5  # samples of the round trip, and its largest error
+GOOD = 0.03  # score up to which no spectral coordinates are tried
 
 Warp = tuple[Array, Array, Array]
 
@@ -145,9 +147,7 @@ def coarse_spectral_icp(
     return match, warp
 
 
-def dense_spectral_icp(
-    source: Basis, target: Basis, warp: Warp, *, iterations: int = 3
-) -> tuple[Array, Warp]:
+def dense_spectral_icp(source: Basis, target: Basis, warp: Warp) -> tuple[Array, Warp]:
     """Spectral ICP at full resolution, on vertices near coarse ones; R and t of parts are fixed.
 
     Parameters
@@ -164,7 +164,7 @@ def dense_spectral_icp(
     """
     match = nearest_vertices(source, target.moved_to(move(target, warp)))
     R, t, _ = warp
-    for _ in range(iterations):
+    for _ in range(3):
         if R.ndim == 2:
             warp = fit_warp(source, target, match)
         else:
@@ -179,20 +179,12 @@ def dense_spectral_icp(
     return match, warp
 
 
-def registration_score(
-    source: Basis,
-    target: Basis,
-    match: Array,
-    moved: Basis,
-    *,
-    n_samples: int = 300,
-    limit: float = 0.5,
-) -> float:
+def registration_score(source: Basis, target: Basis, match: Array, moved: Basis) -> float:
     """Score a registration without ground truth: round trip plus distances; lower is better.
 
     The round trip goes from a vertex of the target to its match and back to the vertex whose
     registered position and normal are nearest; its error is the path length along the edges of the
-    target, at most `limit`.  The distances are the mean distances between registered target and
+    target, at most 0.5.  The distances are the mean distances between registered target and
     source, in both directions, at the vertices near coarse ones, and ``_landmark_distance``.
     Lengths are for unit area.
 
@@ -212,10 +204,10 @@ def registration_score(
     back = X[tree.query(source.tree.data[source.near_coarse])[1]]
     back_distance = np.linalg.norm(source.X[source.near_coarse] - back, axis=1)
     distance = np.linalg.norm(X[rows] - source.X[match], axis=1)
-    n_samples = min(n_samples, len(match))
+    n_samples = min(N_TRIPS, len(match))
     sample = target.outwards[np.linspace(0, len(match) - 1, n_samples).astype(int)]
     end = tree.query(source.tree.data[match[sample]])[1]
-    trip = path_lengths(target.graph, rows[sample], end, limit)
+    trip = path_lengths(target.graph, rows[sample], end, LONGEST_TRIP)
     return float(
         trip.mean() + distance.mean() + back_distance.mean() + _landmark_distance(source, target, X)
     )
@@ -264,13 +256,12 @@ def candidates(
     matches: dict[str, Array],
     *,
     k: int = 100,
-    max_score: float = 0.03,
     articulated: bool = True,
 ) -> dict[str, Candidate]:
     """Return candidates at low resolution: every initial match, before and after spectral ICP.
 
     The better match also initialises iterations with spectral coordinates: piecewise rigid ones if
-    :func:`poses_differ` for all matches, else ordinary ones if all scores exceed `max_score`, as
+    :func:`poses_differ` for all matches, else ordinary ones if all scores exceed :data:`GOOD`, as
     the shapes then differ much.
 
     Parameters
@@ -302,7 +293,7 @@ def candidates(
             *initial, k_initial=20, k=k, iterations=1, spectral=0.2, articulated=True
         )
         add(f"{best}+parts", *piecewise)
-    elif min(candidate.score for candidate in results.values()) > max_score:
+    elif min(candidate.score for candidate in results.values()) > GOOD:
         add(f"{best}+joint+spectral", *coarse_spectral_icp(*initial, k=k, spectral=0.1))
     return results
 

@@ -25,7 +25,7 @@ from s4a.method.median import median_shape
 from s4a.method.register import from_latent, identity, match_functions, match_low
 from s4a.method.shape import Basis, Shape
 from s4a.options import N_SAMPLES, check, kept_options, names_of
-from s4a.schema import check_count, check_type, dataset, require
+from s4a.schema import Array, check_count, check_type, dataset, require
 
 PROJECTION = names_of("projection")
 REGISTRATION = [*names_of("registration"), "alignment", "dense_match", *PROJECTION]
@@ -279,7 +279,7 @@ def with_transforms(
     transforms: dict[str, RigidTransform],
     reference: str,
     residuals: Sequence[float],
-    distance: np.ndarray,
+    distance: Array,
 ) -> xr.Dataset:
     """Add to a network the transforms onto the `reference`, their residuals, spectral distances."""
     R, t = (np.stack(values) for values in zip(*transforms.values(), strict=True))
@@ -391,7 +391,7 @@ def refine_network(
             f"k must be at least {C_initial.shape[1]}, the size of the initial maps; found {k}"
         )
     iterations: dict[str, xr.Dataset] = {}
-    history: list[tuple[int, np.ndarray, np.ndarray]] = []
+    history: list[tuple[int, Array, Array]] = []
 
     def keep(C, Y, latent_eigenvalue, weight, error):
         history.append((len(Y[0]), weight, error))
@@ -496,12 +496,6 @@ def basis_in(study: Study, name: str) -> Basis:
     return Shape(coarse=study[f"coarse/{name}"]).low
 
 
-def options_of_registration(study: xr.DataTree) -> dict[str, Any]:
-    """Return the options of registration that the report of a study names."""
-    check_type(study, xr.DataTree)
-    return {name: v for name, v in kept_options(study).items() if name in REGISTRATION}
-
-
 def template_of(study: xr.DataTree) -> str:
     """Return the name of the template of a study; the median shape if nothing is registered yet."""
     if "registration" in study and "template" in study["registration"].attrs:
@@ -551,7 +545,7 @@ def out_of_sample_basis_in(
     basis: Basis,
     transforms: Callable[[str], RigidTransform],
     **options: Any,
-) -> np.ndarray:
+) -> Array:
     """Compute the latent basis Y ``(k, m)`` of an out-of-sample shape (eq. 3).
 
     Parameters
@@ -697,7 +691,6 @@ def register_shape(
     template: str | None = None,
     *,
     initial_transform: RigidTransform | None = None,
-    dense_match: str | None = None,
     **options: Any,
 ) -> xr.Dataset:
     """Register one shape of a study to the template (4.2; eq. 6, 7 and 8).
@@ -715,11 +708,8 @@ def register_shape(
         Approximate rigid transform R x + t of the shape onto the template.  Both are centred and
         scaled to unit area.  The default is the alignment of the network, or ICP from the principal
         axes if there is none.
-    dense_match : {"latent", "fmap"}, optional
-        Match by the latent bases (eq. 7), or by functional maps (eq. 3 and 4).  By default as in
-        the report of the study.
     **options
-        Those of :class:`s4a.Options` for registrations, such as ``refine`` and ``remove_size``;
+        Those of :class:`s4a.Options` for registrations, such as ``dense_match`` and ``refine``;
         the message about another one lists them.  Options that are missing or None have the values
         in the report of the study, or their defaults if there is no report.
 
@@ -776,14 +766,9 @@ def register_shape(
             f"unexpected options {', '.join(unknown)}; those of a registration are "
             f"{', '.join(REGISTRATION)}"
         )
-    given = {
-        key: value
-        for key, value in (options | {"dense_match": dense_match}).items()
-        if value is not None
-    }
-    options = options_of_registration(study) | given
-    for option in options.keys() & {"refine", "alignment", "displacement_alignment", "dense_match"}:
-        check(option, options[option])
+    check_type(study, xr.DataTree)
+    kept = {name: value for name, value in kept_options(study).items() if name in REGISTRATION}
+    options = kept | {name: check(name, v) for name, v in options.items() if v is not None}
     projection = {key: options.pop(key) for key in PROJECTION if key in options}
     template = template_of(study) if template is None else template
     target = shape_in(Study(study), template, **projection)

@@ -15,6 +15,7 @@ from matplotlib import colormaps
 from matplotlib.colors import Colormap, to_hex
 from matplotlib.figure import Figure
 
+from s4a.schema import Array
 from s4a.show import charts
 from s4a.show.draw import SIGNED, UNKNOWN, Viewpoint, data_uri, image_bytes, rotation
 
@@ -37,7 +38,7 @@ FRAME = script("dom", "frame_widget")
 # ---- numbers for the scripts
 
 
-def to_bytes(array: np.ndarray | list[Any], kind: str) -> bytes:
+def to_bytes(array: Array | list[Any], kind: str) -> bytes:
     """Return an array as contiguous little-endian bytes.
 
     Examples
@@ -49,7 +50,7 @@ def to_bytes(array: np.ndarray | list[Any], kind: str) -> bytes:
     return np.ascontiguousarray(array, np.dtype(kind).newbyteorder("<")).tobytes()
 
 
-def color_bytes(colors: np.ndarray | list[Any]) -> bytes:
+def color_bytes(colors: Array | list[Any]) -> bytes:
     """Return colours ``(n, 3)`` from 0 to 1 as bytes; non-finite rows are grey."""
     colors = np.asarray(colors, float)
     known = np.where(np.isfinite(colors), np.clip(colors, 0, 1), UNKNOWN)
@@ -72,7 +73,7 @@ def color_scale(colormap: str | Colormap, low: float, high: float, label: str) -
     }
 
 
-def mesh_state(mean: np.ndarray, triangles: np.ndarray, deformation: np.ndarray) -> dict[str, Any]:
+def mesh_state(mean: Array, triangles: Array, deformation: Array) -> dict[str, Any]:
     """Return a mean shape ``(n, 3)``, its triangles and deformations ``(c, n, 3)`` as bytes."""
     return {
         "mean": to_bytes(mean, "float32"),
@@ -139,7 +140,7 @@ def numeral(value: object) -> str:
     return f"{value:,.1f}" if isinstance(value, float | np.floating) else str(value)
 
 
-def webp_uri(pixels: np.ndarray) -> str:
+def webp_uri(pixels: Array) -> str:
     """Return a rendered picture as a data URI."""
     return data_uri(image_bytes(pixels))
 

@@ -16,6 +16,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from s4a.geometry.mesh import as_arrays
+from s4a.schema import Array
 from s4a.show.draw import (
     CYCLE_ERROR,
     SIGNED,
@@ -63,13 +64,13 @@ def _figure(width, height, columns=1, rows=1, kind=Figure):
         return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def on_circle(n: int) -> np.ndarray:
+def on_circle(n: int) -> Array:
     """Return `n` equidistant points ``(n, 2)`` on the unit circle."""
     angle = 2 * np.pi * np.arange(n) / max(n, 1)
     return np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
 
-def reach(values: np.ndarray, share: float) -> float:
+def reach(values: Array, share: float) -> float:
     """Return the `share` quantile of the absolute values without NaN; 0 if all are NaN.
 
     Examples
@@ -85,7 +86,7 @@ def reach(values: np.ndarray, share: float) -> float:
 
 def surfaces(
     meshes: dict[str, xr.Dataset],
-    values: dict[str, np.ndarray] | None = None,
+    values: dict[str, Array] | None = None,
     *,
     limit: float | None = None,
     label: str = "",
@@ -250,14 +251,12 @@ def _names(ax, positions, names):
 
 
 def network(
-    positions: np.ndarray,
+    positions: Array,
     names: list[str],
-    source: np.ndarray,
-    target: np.ndarray,
-    errors: dict[str, np.ndarray],
+    source: Array,
+    target: Array,
+    errors: dict[str, Array],
     highlight: int | None = None,
-    *,
-    limits: tuple[float, float] | None = None,
 ) -> Figure:
     """Draw the network of maps once for each array of edge errors, on one logarithmic scale.
 
@@ -272,9 +271,6 @@ def network(
         Title of each picture, and the errors that colour its edges; NaN is grey.
     highlight : int, optional
         Index of a node to mark.
-    limits : (float, float), optional
-        Ends of the scale (:func:`s4a.show.draw.cycle_error_limits`); by default those of all
-        `errors`.
 
     Returns
     -------
@@ -290,7 +286,7 @@ def network(
     <Figure ...>
     """
     figure, (axes,) = _figure(4.6 * len(errors) + 0.6, 4.2, len(errors))
-    limits = limits or cycle_error_limits(*errors.values())
+    limits = cycle_error_limits(*errors.values())
     edges = np.stack([positions[source], positions[target]], axis=1)  # (pair, 2, 2)
     for ax, (title, value) in zip(axes, errors.items(), strict=True):
         order = np.argsort(np.nan_to_num(value, nan=-1))  # the largest on top, unknown below
@@ -314,22 +310,13 @@ def network(
     return figure
 
 
-def matrices(
-    named: dict[str, np.ndarray],
-    limit: float = 1.0,
-    *,
-    axes: tuple[str, str] = ("eigenfunction of the source", "eigenfunction of the target"),
-) -> Figure:
-    """Draw matrices side by side with signed colours, blue positive.
+def matrices(named: dict[str, Array]) -> Figure:
+    """Draw functional maps side by side with signed colours from -1 to 1, blue positive.
 
     Parameters
     ----------
     named : dict of str to float ndarray (rows, columns)
         Title of each matrix and its entries.
-    limit : float
-        Absolute value at the ends of the scale.
-    axes : (str, str)
-        Labels of the columns and of the rows.
 
     Returns
     -------
@@ -345,17 +332,16 @@ def matrices(
     """
     figure, (frames,) = _figure(3.4 * len(named) + 0.7, 3.3, len(named))
     for ax, (title, values) in zip(frames, named.items(), strict=True):
-        image = ax.imshow(values, cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest")
-        ax.set(title=title, xlabel=axes[0], ylabel=axes[1])
+        image = ax.imshow(values, cmap=SIGNED, vmin=-1, vmax=1, interpolation="nearest")
+        ax.set(title=title, xlabel="eigenfunction of the source")
+        ax.set_ylabel("eigenfunction of the target")
         for axis in (ax.xaxis, ax.yaxis):
             axis.set_major_locator(MaxNLocator(5, integer=True))
     figure.colorbar(image, ax=list(frames), shrink=0.8, pad=0.01)
     return figure
 
 
-def ranked(
-    names: list[str], values: np.ndarray, label: str, highlight: int | None = None
-) -> Figure:
+def ranked(names: list[str], values: Array, label: str, highlight: int | None = None) -> Figure:
     """Draw bars in ascending order; `highlight` is the index of a shape to mark.
 
     Examples
@@ -377,7 +363,7 @@ def ranked(
     return figure
 
 
-def stacked(names: list[str], parts: list[str], seconds: np.ndarray) -> Figure:
+def stacked(names: list[str], parts: list[str], seconds: Array) -> Figure:
     """Draw a stacked bar of seconds for each name, with the total at its end (Fig. 3).
 
     Parameters
@@ -407,7 +393,7 @@ def stacked(names: list[str], parts: list[str], seconds: np.ndarray) -> Figure:
     return figure
 
 
-def variance(high: np.ndarray | list[Any], low: np.ndarray | list[Any] | None = None) -> Figure:
+def variance(high: Array | list[Any], low: Array | list[Any] | None = None) -> Figure:
     """Draw the cumulative explained variance at both resolutions (Fig. 5).
 
     Examples
@@ -435,7 +421,7 @@ def variance(high: np.ndarray | list[Any], low: np.ndarray | list[Any] | None = 
 
 
 def scores(
-    score: np.ndarray,
+    score: Array,
     names: list[str],
     highlight: int | None = None,
     faint: Sequence[bool] | None = None,

@@ -12,6 +12,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from s4a.geometry.mesh import triangle_normals, vertex_normals
+from s4a.schema import Array
 
 Viewpoint = str | tuple[float, float]  # a name of VIEWS, or azimuth and elevation in degrees
 VIEWS = {
@@ -38,7 +39,7 @@ LASSO = 600  # samples along the picture that decides which vertices are hidden
 CHUNK = 2_000_000  # candidate samples at a time, about 100 MB
 
 
-def rotation(view: Viewpoint = "corner", up: str = "z") -> np.ndarray:
+def rotation(view: Viewpoint = "corner", up: str = "z") -> Array:
     """Return the rotation ``(3, 3)`` into the picture: rows right, up and towards the viewer.
 
     Parameters
@@ -85,9 +86,7 @@ def _angles(view):
     return VIEWS[view] if isinstance(view, str) else view
 
 
-def rasterise(
-    P: np.ndarray, T: np.ndarray, width: int, height: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def rasterise(P: Array, T: Array, width: int, height: int) -> tuple[Array, Array, Array, Array]:
     """Return the visible triangle of each sample of the picture, by a z-buffer.
 
     Parameters
@@ -106,10 +105,11 @@ def rasterise(
         Barycentric weights in that triangle.
     depth : float32 ndarray (s,)
     """
-    corners = P[T][..., :2]  # (m, 3, 2)
+    a, b, c = corners = [P[:, :2].take(corner, axis=0) for corner in T.T]  # (m, 2) each
     # the box of the samples whose centres may lie in the triangle
-    low = np.maximum(np.ceil(corners.min(1) - 0.5), 0).astype(np.int64)
-    high = np.floor(corners.max(1) - 0.5)
+    low = np.ceil(np.minimum(np.minimum(a, b), c) - 0.5)
+    low = np.maximum(low, 0).astype(np.int64)
+    high = np.floor(np.maximum(np.maximum(a, b), c) - 0.5)
     high = np.minimum(high, (width - 1, height - 1)).astype(np.int64)
     box = np.maximum(high - low + 1, 0)
     samples = box[:, 0] * box[:, 1]
@@ -126,9 +126,10 @@ def rasterise(
         count = samples[part]
         owner = np.repeat(part, count)  # the triangle of each sample of its box
         index = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)  # in the box
-        dy, dx = np.divmod(index, box[owner, 0])
-        wb = start[owner, 0] + slopes[owner, 0] * dx + slopes[owner, 1] * dy
-        wc = start[owner, 1] + slopes[owner, 2] * dx + slopes[owner, 3] * dy
+        dy, dx = np.divmod(index, np.repeat(box[part, 0], count))
+        planes = np.repeat(np.c_[start[part], slopes[part]], count, axis=0).T
+        wb = planes[0] + planes[2] * dx + planes[3] * dy
+        wc = planes[1] + planes[4] * dx + planes[5] * dy
         inside = np.flatnonzero((wb >= 0) & (wc >= 0) & (wb + wc <= 1))
         owner, wb, wc = owner[inside], wb[inside], wc[inside]
         sample = (low[owner, 1] + dy[inside]) * width + low[owner, 0] + dx[inside]
@@ -141,9 +142,7 @@ def rasterise(
     return sample, seen[sample], weights[sample], nearest[sample]
 
 
-def vertices_within(
-    X: np.ndarray, T: np.ndarray, polygon: np.ndarray | list[Any], rotation: np.ndarray
-) -> np.ndarray:
+def vertices_within(X: Array, T: Array, polygon: Array | list[Any], rotation: Array) -> Array:
     """Return the visible vertices inside a polygon in the picture's plane.
 
     Parameters
@@ -195,7 +194,7 @@ def _weight_planes(corners, low):
     start : float32 ndarray (m, 2)
         Both weights at the first sample of the box.
     """
-    ax, ay, bx, by, cx, cy = corners.reshape(-1, 6).T
+    (ax, ay), (bx, by), (cx, cy) = (corner.T for corner in corners)
     double_area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
     scale = 1 / np.where(double_area == 0, 1, double_area)
     slopes = np.stack([cy - ay, ax - cx, ay - by, bx - ax], axis=1) * scale[:, None]
@@ -206,23 +205,23 @@ def _weight_planes(corners, low):
     return double_area, slopes.astype(np.float32), start.astype(np.float32)
 
 
-def plane_box(points: np.ndarray, view: Viewpoint = "corner", up: str = "z") -> np.ndarray:
+def plane_box(points: Array, view: Viewpoint = "corner", up: str = "z") -> Array:
     """Return the bounding box ``(2, 2)`` of points in the picture's plane, for `render`."""
     plane = np.asarray(points, float).reshape(-1, 3) @ rotation(view, up)[:2].T
     return np.stack([plane.min(0), plane.max(0)])
 
 
 def render(
-    points: np.ndarray,
-    triangles: np.ndarray,
+    points: Array,
+    triangles: Array,
     *,
-    colors: np.ndarray | None = None,
+    colors: Array | None = None,
     flat: bool = False,
     view: Viewpoint = "corner",
     up: str = "z",
     size: tuple[int, int] = (500, 400),
-    frame: np.ndarray | None = None,
-) -> np.ndarray:
+    frame: Array | None = None,
+) -> Array:
     """Render a surface: orthographic, softly lit, antialiased, on a transparent background.
 
     Parameters
@@ -341,7 +340,7 @@ def _light(N, base, crease):
     return np.clip(base * light[:, None] + shine[:, None], 0, 1)
 
 
-def signed_colors(values: np.ndarray, limit: float) -> np.ndarray:
+def signed_colors(values: Array, limit: float) -> Array:
     """Return colours ``(n, 3)`` of signed values, white at 0.
 
     Blue is positive (expansion), red is negative (compression).
@@ -364,11 +363,11 @@ def signed_colors(values: np.ndarray, limit: float) -> np.ndarray:
 
 
 def ramp_colors(
-    values: np.ndarray,
+    values: Array,
     low: float | None = None,
     high: float | None = None,
     colormap: str | Colormap = "viridis",
-) -> np.ndarray:
+) -> Array:
     """Return colours ``(n, 3)`` of values from `low` to `high`, by default their range.
 
     NaN stays NaN.
@@ -381,7 +380,7 @@ def ramp_colors(
     return np.where(np.isnan(values)[..., None], np.nan, colors)
 
 
-def label_colors(labels: np.ndarray) -> np.ndarray:
+def label_colors(labels: Array) -> Array:
     """Return colours ``(n, 3)`` of integer labels: Okabe and Ito's, then darker and lighter ones.
 
     Examples
@@ -402,7 +401,7 @@ def label_colors(labels: np.ndarray) -> np.ndarray:
     return palette[index.reshape(np.shape(labels)) % len(palette)]
 
 
-def cycle_error_limits(*errors: np.ndarray) -> tuple[float, float]:
+def cycle_error_limits(*errors: Array) -> tuple[float, float]:
     """Return the ends of the colour scale of cycle errors, from the errors of all stages.
 
     A study has one scale: maps before and after Consistent ZoomOut can be compared, and an error
@@ -435,7 +434,7 @@ def cycle_error_limits(*errors: np.ndarray) -> tuple[float, float]:
     return float(np.clip(known.min(initial=high), high / largest, high / smallest)), high
 
 
-def cycle_error_colors(errors: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
+def cycle_error_colors(errors: Array, limits: tuple[float, float]) -> Array:
     """Return colours ``(pair, 3)`` of cycle errors on a logarithmic scale, yellow-green to violet.
 
     Parameters
@@ -458,7 +457,7 @@ def cycle_error_colors(errors: np.ndarray, limits: tuple[float, float]) -> np.nd
     return np.asarray(CYCLE_ERROR(share))[..., :3]
 
 
-def position_colors(points: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
+def position_colors(points: Array, among: Array | None = None) -> Array:
     """Return colours ``(n, 3)`` of positions: the coordinates as red, green and blue.
 
     The scale is that of the points `among`, by default the points themselves; NaN stays NaN.
@@ -478,7 +477,7 @@ def position_colors(points: np.ndarray, among: np.ndarray | None = None) -> np.n
     return 0.12 + 0.83 * (points - low) / np.maximum(high - low, np.finfo(float).tiny)
 
 
-def checkerboard(coordinates: np.ndarray, cell: float) -> np.ndarray:
+def checkerboard(coordinates: Array, cell: float) -> Array:
     """Return the brightness ``(n,)`` of a checkerboard of cubes of side `cell`: 1 or 0.5.
 
     NaN stays NaN.
@@ -499,8 +498,8 @@ def checkerboard(coordinates: np.ndarray, cell: float) -> np.ndarray:
 
 
 def with_balls(
-    points: np.ndarray, triangles: np.ndarray, colors: np.ndarray | None, balls: list[list[float]]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    points: Array, triangles: Array, colors: Array | None, balls: list[list[float]]
+) -> tuple[Array, Array, Array | None]:
     """Add spheres to a surface: return points, triangles and colours of both.
 
     A ball is x, y, z, red, green, blue, radius.
@@ -538,7 +537,7 @@ def with_balls(
     )
 
 
-def image_bytes(picture: np.ndarray, kind: str = "webp") -> bytes:
+def image_bytes(picture: Array, kind: str = "webp") -> bytes:
     """Return a picture ``(height, width, 4)`` as an image file: small ``webp`` or exact ``png``.
 
     Examples
@@ -553,7 +552,7 @@ def image_bytes(picture: np.ndarray, kind: str = "webp") -> bytes:
     return file.getvalue()
 
 
-def on_white(picture: np.ndarray) -> np.ndarray:
+def on_white(picture: Array) -> Array:
     """Blend a picture ``(height, width, 4)`` with white to ``(height, width, 3)``."""
     opacity = picture[..., 3:] / 255
     return (picture[..., :3] * opacity + 255 * (1 - opacity) + 0.5).astype(np.uint8)

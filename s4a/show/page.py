@@ -32,7 +32,7 @@ from s4a.show.surfaces import (
 )
 from s4a.study.tree import left_out, seconds_of
 
-LARGE = 20_000  # vertices above which a page deforms the low-resolution mesh
+LARGE = 20_000  # vertices above which a page deforms the low-resolution mesh, in larger steps
 N_TRANSFERRED = 5  # shapes to which the template's colours are transferred
 
 
@@ -248,7 +248,7 @@ def _distances(study, camera):
 
 def _sliders(study, camera):
     """Return sliders that deform the mean shape, with precomputed pictures as a fallback."""
-    n_frames = 13 if study["registration"].sizes["vertex"] < 50_000 else 7
+    n_frames = 13 if study["registration"].sizes["vertex"] <= LARGE else 7
     sigmas, ratio = np.linspace(-SIGMA, SIGMA, n_frames).tolist(), _ratio(study)
     sliders = []
     for mode, drawn in enumerate(mode_pictures(study, sigmas, len(ratio), **camera)):

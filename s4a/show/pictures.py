@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
+from s4a.schema import Array, check_count, check_rows
 from s4a.show.browser import appearance_state, color_scale
 from s4a.show.charts import reach
 from s4a.show.draw import SIGNED, Viewpoint, plane_box, render, rotation, signed_colors
@@ -26,7 +27,7 @@ BAND = 1_000_000  # pixels that are rendered at once, about 500 MB
 FILMS = {".gif": "GIF", ".webp": "WEBP", ".apng": "PNG"}
 
 
-def shared_frames(surfaces: list[np.ndarray], camera: dict[str, Any]) -> list[np.ndarray]:
+def shared_frames(surfaces: list[Array], camera: dict[str, Any]) -> list[Array]:
     """Return a frame ``(2, 2)`` around each surface, all of one size, so that sizes compare."""
     boxes = np.array([plane_box(X, **camera) for X in surfaces])
     half = (boxes[:, 1] - boxes[:, 0]).max(0) / 2
@@ -41,7 +42,7 @@ def mode_pictures(
     size: tuple[int, int] = PANEL,
     view: Viewpoint = "corner",
     up: str = "z",
-) -> list[list[np.ndarray]]:
+) -> list[list[Array]]:
     """Return pictures ``(height, width, 4)``, a row for each mode and a column for each score.
 
     They have one frame, with room for three standard deviations, and one colour scale
@@ -50,7 +51,13 @@ def mode_pictures(
     draw = _modes(study, np.arange(1, 1 + n_modes), view, up)
     frame = _frames([draw((-SIGMA, SIGMA))], True)[0]
     options = {"view": "top", "size": size, "frame": frame}
-    pictures = [render(c.points, c.triangles, colors=c.colors, **options) for c in draw(scores)]
+    pictures: list[np.ndarray] = []
+    for i, cell in enumerate(draw(scores)):
+        column = i % len(scores)
+        if column < i and scores[column] == 0:  # the mean is the same in all rows
+            pictures.append(pictures[column])
+        else:
+            pictures.append(render(cell.points, cell.triangles, colors=cell.colors, **options))
     return [pictures[i : i + len(scores)] for i in range(0, len(pictures), len(scores))]
 
 
@@ -58,9 +65,9 @@ class Cell(NamedTuple):
     """A surface in a picture, with axes right, up and towards the viewer."""
 
     title: str
-    points: np.ndarray  # (n, 3)
-    triangles: np.ndarray
-    colors: np.ndarray | None
+    points: Array  # (n, 3)
+    triangles: Array
+    colors: Array | None
     bar: dict[str, Any]  # result of color_scale, or empty
 
 
@@ -70,7 +77,7 @@ def write_picture(
     *,
     mode: int | Sequence[int] | None = None,
     score: float | Sequence[float] = (-SIGMA, 0, SIGMA),
-    values: np.ndarray | None = None,
+    values: Array | None = None,
     label: str = "",
     title: str = "",
     view: Viewpoint = "corner",
@@ -147,7 +154,7 @@ def write_film(
     reach: float = SIGMA,
     turn: bool = False,
     score: float = 0.0,
-    values: np.ndarray | None = None,
+    values: Array | None = None,
     label: str = "",
     title: str = "",
     view: Viewpoint = "corner",
@@ -210,7 +217,7 @@ def write_film(
     """
     path = _checked(path, FILMS, width)
     draw, axis, shared = _source(data, mode, values, label, view, up)
-    _whole("n_frames", n_frames, 2, 10_000)
+    check_count("n_frames", n_frames, 2, 10_000)
     for name, given, more in (
         ("score", score, ""),
         ("reach", reach, ""),
@@ -252,16 +259,10 @@ def _checked(path: Path | str, endings: Iterable[str], width: int) -> Path:
     if path.suffix.lower() not in endings:
         more = "; a panel's Save film writes WebM" if path.suffix == ".webm" else ""
         raise ValueError(f"the file has to end in {' or '.join(endings)}, found {path.name}{more}")
-    _whole("width (pixels)", width, 100, WIDEST)
+    check_count("width (pixels)", width, 100, WIDEST)
     if not path.parent.is_dir():
         raise ValueError(f"the folder {path.parent} does not exist: make it, or give another path")
     return path
-
-
-def _whole(name, given, low, high):
-    """Raise ValueError unless `given` is an integer from `low` to `high`."""
-    if not isinstance(given, int | np.integer) or not low <= given <= high:
-        raise ValueError(f"{name} needs a whole number from {low} to {high}, found {given!r}")
 
 
 def _numbers(name, given):
@@ -295,11 +296,8 @@ def _source(data, mode, values, label, view, up):
     cells = []
     if isinstance(data, xr.Dataset) and "corner_vertex" in data:
         X, T = as_arrays(data)
-        if values is not None and np.shape(values) not in ((len(X),), (len(X), 3)):
-            raise ValueError(
-                f"values need a number or a colour (r, g, b) for each of the {len(X)} vertices, "
-                f"found an array of shape {np.shape(values)}"
-            )
+        if values is not None:
+            check_rows("values", values, (len(X),), (len(X), 3))
         cells.append(Cell("", X @ R.T, T, *_value_colors(values, label)))
     elif hasattr(data, "comm"):  # a widget
         cells, axis = list(_views(data)), np.array([0.0, 1, 0])

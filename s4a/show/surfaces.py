@@ -6,10 +6,7 @@ import numpy as np
 import xarray as xr
 
 from s4a.method.pca import color_limits, low_vertices
-from s4a.method.register import match_functions, match_low
-from s4a.method.shape import Shape
-from s4a.method.steps import Study, latent_bases
-from s4a.schema import INPUT, unit_of
+from s4a.schema import INPUT, Array, unit_of
 from s4a.show.draw import cycle_error_limits
 
 N_LIVE = 20  # default number of modes in panels and pages: 0.3 MB each for 20,000 vertices
@@ -58,12 +55,12 @@ def label_text(mesh: xr.Dataset, value: Any) -> str:
     return f"{value} {names[value]}" if value in range(len(names)) else str(value)
 
 
-def mesh_of(mesh: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+def mesh_of(mesh: xr.Dataset) -> tuple[Array, Array]:
     """Return positions and triangles of a mesh."""
     return mesh["position"].values, mesh["corner_vertex"].values
 
 
-def aligned(study: xr.DataTree, name: str, X: np.ndarray) -> np.ndarray:
+def aligned(study: xr.DataTree, name: str, X: Array) -> Array:
     """Return points ``(n, 3)`` of a shape aligned to the template, if the shape is registered."""
     registration = study["registration"].dataset if has(study, "registration/rotation") else None
     if registration is None or name not in names_of(registration):
@@ -78,15 +75,10 @@ def low_text(mesh: xr.Dataset) -> str:
     return SAMPLES if "local_weight" in mesh else ""
 
 
-def surface(study: xr.DataTree, name: str, stage: str = "coarse") -> tuple[np.ndarray, np.ndarray]:
+def surface(study: xr.DataTree, name: str, stage: str = "coarse") -> tuple[Array, Array]:
     """Return aligned positions and triangles of a shape at stage ``coarse`` or ``original``."""
     X, T = mesh_of(study[stage][name].dataset)
     return aligned(study, name, X), T
-
-
-def resolutions(study: xr.DataTree) -> list[tuple[str, str]]:
-    """Return the resolutions of the study as options of a list: text and stage."""
-    return [(text, stage) for text, stage in RESOLUTIONS if has(study, stage)]
 
 
 def unit_text(study: xr.DataTree, name: str) -> str:
@@ -98,7 +90,7 @@ def unit_text(study: xr.DataTree, name: str) -> str:
     return unit_of(study["pca"].dataset["mean_displacement"]) if known else INPUT
 
 
-def barycentric(study: xr.DataTree, name: str) -> tuple[np.ndarray, np.ndarray] | None:
+def barycentric(study: xr.DataTree, name: str) -> tuple[Array, Array] | None:
     """Return the vertices of a shape on the template: corners and barycentric weights ``(v, 3)``.
 
     None if the study does not have them.
@@ -113,8 +105,8 @@ def barycentric(study: xr.DataTree, name: str) -> tuple[np.ndarray, np.ndarray] 
 
 
 def transferred_colors(
-    study: xr.DataTree, name: str, colors: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    study: xr.DataTree, name: str, colors: Array
+) -> tuple[Array, Array, Array] | None:
     """Return the aligned mesh of a shape, with colours transferred from the template's vertices.
 
     None without its mesh; vertices without a colour are NaN.
@@ -134,7 +126,7 @@ def transferred_colors(
     return aligned(study, name, X), T, transferred
 
 
-def template_vertices(study: xr.DataTree, name: str) -> np.ndarray | None:
+def template_vertices(study: xr.DataTree, name: str) -> Array | None:
     """Return for each vertex of a shape the nearest vertex of the template.
 
     None if the study does not have the registration of the shape.
@@ -157,7 +149,7 @@ def template_coarse(study: xr.DataTree) -> xr.Dataset | None:
 
 def mode_arrays(
     study: xr.DataTree, coarse: xr.Dataset | None = None, n_modes: int | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[Array, Array, Array]:
     """Return mean shape ``(n, 3)``, triangles and deformations ``(c, n, 3)``.
 
     If the low-resolution mesh `coarse` is given, they are those of its vertices.
@@ -214,7 +206,7 @@ def near_excluded(pca: xr.Dataset) -> dict[str, list[float]]:
     return dict(zip(names, near["score_excluded"].values.tolist(), strict=True))
 
 
-def network_positions(study: xr.DataTree, names: list[str]) -> np.ndarray | None:
+def network_positions(study: xr.DataTree, names: list[str]) -> Array | None:
     """Return positions ``(n, 2)``: first two components of the area-based shape differences.
 
     None if the study does not have both for all shapes.
@@ -232,18 +224,3 @@ def network_limits(study: xr.DataTree) -> tuple[float, float]:
     network = study["network"].dataset
     keys = ("cycle_error_initial", "cycle_error")
     return cycle_error_limits(*(network[key].values for key in keys if key in network))
-
-
-def latent_match(study: xr.DataTree, source: str, target: str, *, dense: bool) -> np.ndarray:
-    """Return the vertex of `source` that the latent basis matches to each vertex of `target`.
-
-    These are nearest rows of Phi Y on the coarse meshes (eq. 3), or, if `dense`, of U Phi Y on all
-    vertices (eq. 7).
-    """
-    M, N = (
-        Shape(study["original"][name].to_dataset(), study["coarse"][name].to_dataset())
-        for name in (source, target)
-    )
-    basis_source, basis_target = latent_bases(Study(study), source, target)
-    match, (F_source, F_target) = match_low(M, N, (basis_source, basis_target))
-    return match_functions(M, N, F_source, F_target)[0] if dense else match

@@ -2,8 +2,6 @@
 
 from pkgutil import iter_modules
 
-import lazy_loader
+from lazy_loader import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
-    __name__, [m.name for m in iter_modules(__path__)]
-)
+__getattr__, __dir__, __all__ = attach(__name__, [m.name for m in iter_modules(__path__)])

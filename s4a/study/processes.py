@@ -55,6 +55,8 @@ def limited(n_jobs: int | None, n_tasks: int | None = None) -> int | None:
 def workers(n_jobs: int | None, **options: Any) -> Parallel:
     """Make a :class:`joblib.Parallel` whose processes end within a second of this one.
 
+    The processes are reused by the next call, as joblib does if all settings are equal.
+
     Parameters
     ----------
     n_jobs : int, optional
@@ -74,7 +76,8 @@ def workers(n_jobs: int | None, **options: Any) -> Parallel:
     if isinstance(backend, LokyBackend) and backend.effective_n_jobs(n_jobs) > 1:
         at_once = threading.current_thread() is threading.main_thread()
         options |= {"initializer": begin_worker, "initargs": (os.getpid(), at_once)}
-    return Parallel(n_jobs=n_jobs, **options)
+    # arrays are sent through a pipe, as shared files would outlive a killed run
+    return Parallel(n_jobs=n_jobs, max_nbytes=None, **options)
 
 
 def begin_worker(owner: int, at_once: bool) -> None:

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import xarray as xr
-from scipy import stats
 from scipy.spatial.distance import pdist, squareform
+from scipy.special import betaincc
 
 from s4a.geometry.crossing import can_count
 from s4a.input.plausibility import (
@@ -41,10 +41,13 @@ WRONG_RATIO, UNSURE_RATIO = 2.0, 1.5
 FEW, SHARE, ALONE, LARGE = 6, 0.7, 0.001, 0.3
 # near copies: largest distance over the usual one and over sqrt(area), and largest p value
 NEAR, COPY, CHANCE = 0.2, 0.005, 0.02
+NOT_COMPARED = "quality_control='off': mirrored, partial or duplicate shapes are not detected"
 
 
 def check_plausibility(run: Run, original: Keys, options: Options) -> tuple[Keys, Flags, list[str]]:
     """Compare the shapes with each other, and flag suspect ones.
+
+    With ``quality_control="off"`` they are not compared, and only what cleaning found is reported.
 
     Returns
     -------
@@ -56,6 +59,9 @@ def check_plausibility(run: Run, original: Keys, options: Options) -> tuple[Keys
     if len(original) < 2:
         return original, {}, []
     attrs = {n: attributes(run.folder / f"original/{n}.nc") for n in original}
+    if options.quality_control == "off":
+        flags, remarks = find_warnings(attrs, {})
+        return original, flags, [*remarks, NOT_COMPARED]
     compared = comparisons_of(run, original, options)
     used = {n: attrs[n] for n in compared}
     return {n: original[n] for n in compared}, *find_warnings(used, compared)
@@ -273,7 +279,7 @@ def check_modes(pca: xr.Dataset, area: float) -> Flags:
     names, n = pca["shape"].values.tolist(), pca.sizes["shape"]
     score, ratio = pca["score"].values, pca["explained_variance_ratio"].values
     share = score**2 / (score**2).sum(0)  # (n, c)
-    p = n * stats.beta.sf(share.max(0) * n / (n - 1), 0.5, (n - 2) / 2)
+    p = n * betaincc(0.5, (n - 2) / 2, np.minimum(share.max(0) * n / (n - 1), 1))
     for c in np.flatnonzero((share.max(0) > SHARE) & (p < ALONE) & (ratio > LARGE)):
         values = {"component": c + 1, "percent": 100 * share[:, c].max()}
         one = flag("influential", **values, mode_percent=100 * ratio[c])

@@ -60,7 +60,7 @@ def write_report(
             *reduced_pairs(options.n_pairs, network.sizes["pair"] // 2, len(spectra)),
             *tied(in_network, latent["distance_to_limit"].values),
         ],
-        {name: comparison_of(run, name) for name in names},
+        {name: comparison_of(run, name) for name in names if options.quality_control != "off"},
     )
     if options.reflect is not None:
         report = report.assign(chirality_evidence(run, list(sources), options).variables)

@@ -2,6 +2,7 @@
 
 import contextlib
 import faulthandler
+import functools
 import logging
 import os
 import sys
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from joblib import delayed, effective_n_jobs
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 from tqdm.auto import tqdm
 
 from s4a.input.raw import sentences
@@ -244,8 +245,7 @@ class Run:
                     yield delayed(do_task)(todo[name], self.claim)
 
             n_jobs = max(2, effective_n_jobs(self.n_jobs)) if alone else self.n_jobs
-            # meshes in memory are sent through a pipe, as shared files would outlive a killed run
-            parallel = workers(n_jobs, return_as="generator_unordered", max_nbytes=None)
+            parallel = workers(n_jobs, return_as="generator_unordered")
             try:
                 for outcome in parallel(jobs()):
                     yield outcome
@@ -310,6 +310,12 @@ class Run:
                 self.bar.close()
 
 
+@functools.cache
+def blas() -> ThreadpoolController:
+    """Return the BLAS libraries of this process, which take two milliseconds to find."""
+    return ThreadpoolController()
+
+
 def do_task(task: Task, claim: Claim) -> Outcome:
     """Compute one Dataset and write its file, with one BLAS thread, as tasks run in parallel."""
     claim.check()
@@ -317,7 +323,7 @@ def do_task(task: Task, claim: Claim) -> Outcome:
     failure, unforeseen = "", False
     with at_work(file, claim):
         try:
-            with threadpool_limits(1):
+            with blas().limit(limits=1):
                 data = task.function(*task.arguments)
             name, path = task.file.removesuffix(".nc"), claim.folder / task.file
             write(data, path, task.key, task.made_from, claim, name=name)

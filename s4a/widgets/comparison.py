@@ -11,6 +11,7 @@ import traitlets
 import xarray as xr
 from matplotlib.colors import to_rgb
 
+from s4a.schema import Array
 from s4a.show.browser import color_scale
 from s4a.show.draw import OKABE_ITO, SIGNED, position_colors, ramp_colors, signed_colors
 from s4a.show.surfaces import mesh_of
@@ -152,11 +153,11 @@ class Comparison(Panel):
         """The matches of the pair that is shown, with the target's mesh."""
         return self.pairs[self.pair.value]
 
-    def values(self, name: str, method: str) -> np.ndarray:
+    def values(self, name: str, method: str) -> Array:
         """Return the variable ``algorithm_<name>`` of a method."""
         return self.result[f"algorithm_{name}"].sel(algorithm=method).values
 
-    def error(self, method: str) -> np.ndarray | None:
+    def error(self, method: str) -> Array | None:
         """Return the error of every vertex of the target ``(n,)``; None without ground truth."""
         return self.values("error", method) if "algorithm_error" in self.result else None
 
@@ -210,7 +211,7 @@ class Comparison(Panel):
         scene.connect(match, self.caption(error), error, back=back, color=MARKS[i])
         self.point()
 
-    def caption(self, error: np.ndarray | None, **numbers: Any) -> str:
+    def caption(self, error: Array | None, **numbers: Any) -> str:
         """Return the caption of a vertex of the target; the browser also fills in `numbers`."""
         text = "target vertex {here} → source vertex {there}"
         text += "" if error is None else ", error {value} %"

@@ -4,12 +4,13 @@ import ipywidgets
 import numpy as np
 import traitlets
 
+from s4a.method.steps import latent_match
+from s4a.schema import Array
 from s4a.show.browser import color_scale
 from s4a.show.draw import position_colors, ramp_colors
 from s4a.show.surfaces import (
     has,
     labelled,
-    latent_match,
     mesh_of,
     names_of,
     surface,
@@ -34,7 +35,7 @@ COLORS = (
 CELLS = 14  # of the checkerboard along the surface's extent
 
 
-def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def compose(first: Array, second: Array) -> Array:
     """Return the composition of two matches, -1 where the first has none.
 
     Examples
@@ -47,7 +48,7 @@ def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.where(first < 0, -1, second[first])
 
 
-def inverse(match: np.ndarray, n: int) -> np.ndarray:
+def inverse(match: Array, n: int) -> Array:
     """Return for each of `n` vertices the first one that is matched to it, -1 for none.
 
     Examples
@@ -154,7 +155,7 @@ class Correspondence(Panel):
         """True if the template is on the left."""
         return self.source == self.template
 
-    def match(self) -> np.ndarray:
+    def match(self) -> Array:
         """Return the matched vertex of the shape for each vertex of the source; -1 for none."""
         if self.registered:
             match = self.registered_match(self.shape)
@@ -163,11 +164,12 @@ class Correspondence(Panel):
             return match
         key = self.source, self.shape, self.map.value
         if key not in self.matches:
-            dense = self.map.value == "dense"
-            self.matches[key] = latent_match(self.study, self.shape, self.source, dense=dense)
+            full = self.map.value == "dense"
+            found = latent_match(self.study, self.shape, self.source, full=full)
+            self.matches[key] = found["match"].values
         return self.matches[key]
 
-    def reverse_match(self) -> np.ndarray:
+    def reverse_match(self) -> Array:
         """Return the matched vertex of the source for each vertex of the shape; -1 for none."""
         Y = self.pair[1][0]
         if not self.registered:
@@ -175,23 +177,23 @@ class Correspondence(Panel):
         match = self.to_template(self.shape, Y)
         return match if self.from_template else compose(match, self.registered_match(self.source))
 
-    def registered_match(self, name: str) -> np.ndarray:
+    def registered_match(self, name: str) -> Array:
         """Return the matched vertex of a shape for each vertex of the template."""
         return self.study["registration"].dataset["registered_match"].sel(shape=name).values
 
-    def to_template(self, name: str, X: np.ndarray) -> np.ndarray:
+    def to_template(self, name: str, X: Array) -> Array:
         """Return the template's vertex for each vertex `X` of a shape; -1 for none."""
         vertices = template_vertices(self.study, name)
         return inverse(self.registered_match(name), len(X)) if vertices is None else vertices
 
-    def transferred(self, values: np.ndarray) -> np.ndarray | None:
+    def transferred(self, values: Array) -> Array | None:
         """Return values of the source's vertices on those of the shape, through the template."""
         if not self.from_template:
             values = values[self.registered_match(self.source)]
         transferred = transferred_colors(self.study, self.shape, values)
         return None if transferred is None else transferred[2]
 
-    def confidence(self) -> np.ndarray | None:
+    def confidence(self) -> Array | None:
         """Return the registration's confidence on the template; None for other maps."""
         known = "confidence" in self.study["registration"].data_vars
         if not (known and self.registered and self.from_template):

@@ -6,10 +6,12 @@ import traitlets
 
 from s4a.method.fmap import off_diagonal_mass, orthogonality_error, swapped_blocks, zoomout
 from s4a.method.shape import Shape
+from s4a.schema import Array
 from s4a.show.browser import PARTS
+from s4a.show.charts import reach
 from s4a.show.surfaces import low_text, surface
 from s4a.widgets.panel import WIDE, Panel, checkbox, columns, dropdown, int_slider, row
-from s4a.widgets.views import DIRECTION, Chart, signed_limit
+from s4a.widgets.views import DIRECTION, Chart
 
 STEP = 5
 KINDS = [
@@ -116,7 +118,7 @@ class FunctionalMap(Panel):
             scene.caption = low_text(mesh)
         self.show_cell(self.cell)
 
-    def map_of(self, k: int) -> np.ndarray:
+    def map_of(self, k: int) -> Array:
         """Return C ``(k, k)``: a block of the study's map, or ZoomOut from the initial map."""
         network = self.study["network"].dataset.isel(pair=self.pair)
         if self.kind.value == "study":
@@ -167,7 +169,7 @@ class FunctionalMap(Panel):
             mesh["eigenfunction"].values[:, i]
             for mesh, (_, i) in zip(self.meshes, ends, strict=True)
         ]
-        limit = max(map(signed_limit, functions))
+        limit = max(reach(values, 0.99) for values in functions)
         for (role, i), (scene, mesh, name), values in zip(ends, shapes, functions, strict=True):
             eigenvalue = mesh["eigenvalue"].values[i]
             scene.title = f"{role}{i} on {name}, eigenvalue {eigenvalue:.2f}"

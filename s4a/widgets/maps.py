@@ -8,7 +8,7 @@ import traitlets
 import xarray as xr
 
 from s4a.geometry.mesh import vertex_areas, vertex_normals
-from s4a.schema import unit_of
+from s4a.schema import Array, unit_of
 from s4a.show.browser import color_scale
 from s4a.show.draw import SIGNED, ramp_colors, signed_colors
 from s4a.show.surfaces import has
@@ -115,7 +115,7 @@ class Maps(Panel):
         """Return the positions ``(vertex, xyz)`` of the surface that is shown."""
         return self.study["registration"].dataset["position"]
 
-    def values(self) -> tuple[np.ndarray, bool, str]:
+    def values(self) -> tuple[Array, bool, str]:
         """Return the map ``(n,)``, True if it is signed, and its unit."""
         name = self.map.value
         data = self.result[name]
@@ -124,7 +124,7 @@ class Maps(Panel):
             values = (values * self.normals).sum(1)
         return values, name in self.signed, unit_of(data)
 
-    def significant(self) -> np.ndarray:
+    def significant(self) -> Array:
         """Return a mask ``(n,)`` of the vertices with p up to the level, or of all vertices."""
         if self.where.value == EVERYWHERE:
             return np.ones(len(self.X), bool)
@@ -147,7 +147,7 @@ class Maps(Panel):
         self.vertex = -1
         self.scene.caption = self.summary(shown)
 
-    def summary(self, shown: np.ndarray) -> str:
+    def summary(self, shown: Array) -> str:
         """Return the significant share of the area, and p of the whole shape, as text."""
         parts = []
         if self.where.value != EVERYWHERE:

@@ -6,7 +6,7 @@ import traitlets
 
 from s4a.method.median import NORMS, distance_to_identity, near_ties
 from s4a.show.browser import PARTS
-from s4a.show.surfaces import labelled, names_of, resolutions, surface
+from s4a.show.surfaces import RESOLUTIONS, has, labelled, names_of, surface
 from s4a.widgets.panel import Panel, columns, dropdown, int_slider, row
 from s4a.widgets.views import Chart
 
@@ -48,18 +48,18 @@ class Median(Panel):
         latent = self.study["latent"].dataset
         self.names, k = names_of(latent), latent.sizes["latent"]
         norm, options = str(latent.attrs.get("norm", "h2")), labelled(self.study, self.names)
-        self.operator = self.redrawing(dropdown("operator", OPERATOR, list(OPERATORS)), self.rank)
-        self.norm = self.redrawing(dropdown("norm", NORM, list(NORMS), value=norm), self.rank)
-        size = int_slider("eigenfunctions K", EIGENFUNCTIONS, k, 2, k)
-        self.size = self.redrawing(size, self.rank)
-        stages = dropdown("surfaces", "the resolution of the meshes", resolutions(self.study))
-        self.stage = self.redrawing(stages, self.show)
+        self.operator = dropdown("operator", OPERATOR, list(OPERATORS))
+        self.norm = dropdown("norm", NORM, list(NORMS), value=norm)
+        self.size = int_slider("eigenfunctions K", EIGENFUNCTIONS, k, 2, k)
+        resolutions = [(text, stage) for text, stage in RESOLUTIONS if has(self.study, stage)]
+        self.stage = dropdown("surfaces", "the resolution of the meshes", resolutions)
         self.shape = dropdown("shape", "the shape that is shown", options)
         self.bars, self.ties = Chart(), ipywidgets.HTML()
         self.scene = self.new_scene(420)
         self.on_pick(self.bars, self.pick)
         self.bind(self.shape, "selected")
-        self.redraw(self.show, "selected")
+        self.redraw(self.rank, self.operator, self.norm, self.size)
+        self.redraw(self.show, "selected", self.stage)
         self.rank()
         self.selected = self.median
         return [
@@ -68,15 +68,6 @@ class Median(Panel):
             self.ties,
             columns(self.bars, self.scene),
         ]
-
-    def selection(self) -> dict:
-        """Return the shape that is shown."""
-        return {"shape": self.selected}
-
-    def adopt(self, pair: tuple[str, str], shape: str) -> None:
-        """Show the shape if it is ranked."""
-        if shape in self.names:
-            self.selected = shape
 
     def rank(self) -> None:
         """Compute the distances for the selected operator, norm and number of eigenfunctions."""

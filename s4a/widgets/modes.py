@@ -10,6 +10,7 @@ from s4a.geometry.mesh import vertex_normals
 from s4a.input.files import WITH_VALUES, write_mesh
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import apply_scores, mahalanobis, plausible_scores
+from s4a.schema import Array
 from s4a.show.browser import MODES, appearance_state, mesh_state, to_bytes
 from s4a.show.draw import signed_colors
 from s4a.show.surfaces import (
@@ -77,7 +78,7 @@ class ModesView(View):
         )
         self.observe(self.draw_still, ["webgl", "scores", "colors"])
 
-    def change_mesh(self, mean: np.ndarray, triangles: np.ndarray, deformation: np.ndarray) -> None:
+    def change_mesh(self, mean: Array, triangles: Array, deformation: Array) -> None:
         """Replace the mesh by one with other vertices, in one message."""
         self.arrays = mean, triangles, deformation
         with self.hold_sync():
@@ -85,7 +86,7 @@ class ModesView(View):
                 self.set_trait(name, value)
         self.draw_still()
 
-    def change_triangles(self, triangles: np.ndarray) -> None:
+    def change_triangles(self, triangles: Array) -> None:
         """Replace the triangles, for example to hide some of them."""
         self.arrays = self.arrays[0], triangles, self.arrays[2]
         self.corner = to_bytes(triangles, "uint32")
@@ -160,21 +161,19 @@ class Modes(Panel):
         self.path = file_name("shape.ply")
         mesh_help = "the current shape at full resolution"
         self.ply = self.save_button("Save mesh", lambda: self.save_mesh(self.path.value), mesh_help)
-        page_help = "one HTML file that needs no kernel"
-        self.html = self.save_button(
-            "Save page", lambda: self.save_html(self.page_path()), page_help
-        )
+        page_help = "one HTML file that needs no kernel, with the name of the mesh"
+        self.html = self.save_button("Save page", self.save_page, page_help)
         return [self.view, row(self.resolution, self.path, self.ply, self.html)]
 
-    def arrays(self, resolution: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def arrays(self, resolution: str) -> tuple[Array, Array, Array]:
         """Return mean shape, triangles and deformations at a resolution."""
         return mode_arrays(self.study, None if resolution == "full" else self.coarse, self.n_modes)
 
-    def page_path(self) -> Path:
-        """Return the path of the page, which has the name of the mesh."""
-        return Path(self.path.value).with_suffix(".html")
+    def save_page(self) -> Path:
+        """Save a page with the name of the mesh."""
+        return self.save_html(Path(self.path.value).with_suffix(".html"))
 
-    def vertices(self, resolution: str = "full") -> np.ndarray:
+    def vertices(self, resolution: str = "full") -> Array:
         """Return the vertices ``(n, 3)`` of the current shape, in the unit of the input."""
         mean, _, deformation = self.arrays(resolution)
         return apply_scores(mean, deformation, np.array(self.scores))

@@ -7,6 +7,7 @@ from matplotlib.colors import to_hex
 
 from s4a.method.fmap import match_from_fmap
 from s4a.method.network import choose_pairs, connectivity, nearest_by_maps, spectral_distance
+from s4a.schema import Array
 from s4a.show import charts
 from s4a.show.browser import PARTS, color_scale
 from s4a.show.draw import CYCLE_ERROR, cycle_error_colors, position_colors
@@ -129,14 +130,14 @@ class Network(Panel):
         if self.edge < 0 and shape in self.names:
             self.node = shape
 
-    def positions(self, names: list[str]) -> np.ndarray:
+    def positions(self, names: list[str]) -> Array:
         """Return positions ``(n, 2)`` of nodes, by shape differences or on a circle."""
         positions = None
         if self.where.value == "shape differences":
             positions = network_positions(self.study, names)
         return charts.on_circle(len(names)) if positions is None else positions
 
-    def drawn_shapes(self, pairs: np.ndarray) -> np.ndarray:
+    def drawn_shapes(self, pairs: Array) -> Array:
         """Return the shapes in the graph of some pairs, as indices of `names` ``(n,)``."""
         if len(self.names) <= MOST:
             return np.arange(len(self.names))
@@ -146,7 +147,7 @@ class Network(Panel):
         known = [self.names.index(name) for name in (*first, self.median) if name in self.names]
         return nearest_by_maps(pairs, len(self.names), known, MOST)
 
-    def budgeted(self) -> np.ndarray:
+    def budgeted(self) -> Array:
         """Return the pairs ``(p, 2)`` within the budget: those of the study, or another choice."""
         if self.budget.value == self.used:
             return np.unique(self.pairs, axis=0)
@@ -194,7 +195,7 @@ class Network(Panel):
         scale = color_scale(CYCLE_ERROR, low, high, ERRORS)
         self.bar.value = PARTS.color_bar(scale["colors"], f"{low:.2g}", f"{high:.2g}", ERRORS)
 
-    def show_facts(self, pairs: np.ndarray, values: np.ndarray) -> None:
+    def show_facts(self, pairs: Array, values: Array) -> None:
         """Show connectivity and cycle errors of the graph of some pairs."""
         facts, known = connectivity(pairs, len(self.names)), values[np.isfinite(values)]
         excluded = excluded_of(self.study["registration"]) if "registration" in self.study else []

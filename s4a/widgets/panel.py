@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import anywidget
 import ipywidgets
@@ -16,7 +17,7 @@ from s4a.show.browser import FRAME, PARTS, STYLE
 from s4a.show.draw import Viewpoint
 from s4a.show.panel_page import LIMIT, panel_html, widgets_in
 from s4a.show.surfaces import has
-from s4a.widgets.views import Scene, camera_group
+from s4a.widgets.views import Scene
 
 log = logging.getLogger(__name__)
 WIDE = {"width": "26em"}
@@ -79,12 +80,6 @@ def file_name(name: str) -> ipywidgets.Text:
 def row(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
     """Return a row of widgets that wraps where the cell is narrow."""
     return ipywidgets.HBox(widgets, layout={"flex_flow": "row wrap", "align_items": "center"})
-
-
-def unbroken_row(*widgets: ipywidgets.Widget) -> ipywidgets.HBox:
-    """Return a row of widgets that does not wrap."""
-    layout = {"align_items": "center", "flex": "none", "margin": "0 1em 0 0"}
-    return ipywidgets.HBox(widgets, layout=layout)
 
 
 def columns(*widgets: ipywidgets.Widget, min_width: str = "24em") -> ipywidgets.HBox:
@@ -174,7 +169,9 @@ class Panel(KernelWidget):
     clicks = ()  # chart, key of the clicked mark, and the control that a click sets
     every = ()  # sliders of which all values are recorded, not only two dozen
     python = ()  # other actions that need Python
-    shares = ()  # traits that name the selected pair or shape, for the other tabs
+    # traits that name the selected pair or shape, for the other tabs; a single one is of `names`
+    shares: tuple[str, ...] = ()
+    names: list[str] = []  # noqa: RUF012, of the shapes that can be selected
     scenes: list[Scene] = []  # noqa: RUF012, views that are updated together
     recording = False  # while the values of the controls are recorded for a saved page
 
@@ -197,7 +194,8 @@ class Panel(KernelWidget):
         super().__init__(layout=panel_layout(width))
         self.add_class("s4a-panel")  # in style.css
         self.study = study
-        self.camera: dict[str, Any] = {"group": camera_group(), "view": view, "up": up}
+        # views of one group rotate together
+        self.camera: dict[str, Any] = {"group": uuid4().hex, "view": view, "up": up}
         self.frame = Frame(title=self.title, font=font or 0.0)
         self.message, self.failed = ipywidgets.HTML(), False
         self.children = [self.frame, *self.build(**options), self.message]
@@ -211,11 +209,6 @@ class Panel(KernelWidget):
     def new_scene(self, height: int, **options: Any) -> Scene:
         """Return a view of a surface that rotates with the other views of the panel."""
         return Scene(height=height, **self.camera, **options)
-
-    def redrawing(self, control: ipywidgets.Widget, function: Callable[[], Any]) -> Any:
-        """Call `function` without arguments when `control` changes; return the control."""
-        self.redraw(function, control)
-        return control
 
     def follow(self) -> ipywidgets.Checkbox:
         """Return a checkbox: mark the vertex under the pointer, not only a clicked one."""
@@ -231,10 +224,12 @@ class Panel(KernelWidget):
 
     def selection(self) -> dict[str, Any]:
         """Return the selected ``pair`` (source, target) and ``shape``, by name."""
-        return {}
+        return {"shape": getattr(self, *self.shares)}
 
     def adopt(self, pair: tuple[str, str], shape: str) -> None:
         """Show the pair or shape selected in another tab, if the panel has it; "" for none."""
+        if self.shares and shape in self.names:
+            self.set_trait(*self.shares, shape)
 
     def control(self, name: str) -> ipywidgets.Widget:
         """Return the control of a name in `live`."""

@@ -7,6 +7,7 @@ import numpy as np
 import traitlets
 
 from s4a.method.spectral import reconstruct, weyl
+from s4a.schema import Array
 from s4a.show.charts import BLUE, GREY, ORANGE
 from s4a.show.surfaces import labelled, low_text, surface, unit_text
 from s4a.widgets.panel import Panel, columns, dropdown, int_slider, row
@@ -70,15 +71,6 @@ class Spectrum(Panel):
         charts = columns(self.curves, self.residuals)
         return [row(self.choice), charts, columns(function, surface_of_k)]
 
-    def selection(self) -> dict:
-        """Return the shape whose functions are shown."""
-        return {"shape": self.shape}
-
-    def adopt(self, pair: tuple[str, str], shape: str) -> None:
-        """Show the eigenfunctions of the shape, if it has any."""
-        if shape in self.names:
-            self.shape = shape
-
     def pick(self, mark: dict) -> None:
         """Select the shape of the clicked curve."""
         if mark["series"] in self.names:
@@ -115,7 +107,7 @@ class Spectrum(Panel):
                 marker=self.index.value,
             )
 
-    def curve(self, name: str, law: np.ndarray) -> dict:
+    def curve(self, name: str, law: Array) -> dict:
         """Return the curve of a shape's eigenvalues minus `law`."""
         values, chosen = self.eigenvalues[name], name == self.shape
         last = f"number {len(values) - 1} is {values[-1]:.1f}"

@@ -22,13 +22,13 @@ from scipy.spatial.transform import Rotation
 
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, normal_sums, vertex_normals
-from s4a.schema import check_choice, require
+from s4a.method.steps import latent_match
+from s4a.schema import Array, check_choice, check_rows, require
 from s4a.show import draw
 from s4a.show.browser import color_scale
 from s4a.show.draw import CLAY, SIGNED, Viewpoint
 from s4a.show.surfaces import (
     has,
-    latent_match,
     mode_arrays,
     mode_limits,
     names_of,
@@ -65,7 +65,7 @@ LIGHTS = (  # uniforms that three.js fills in for a lit shader
 
 def surface(
     mesh: xr.Dataset,
-    field: str | np.ndarray | xr.DataArray | None = None,
+    field: str | Array | xr.DataArray | None = None,
     cmap: str | Colormap | None = None,
     *,
     limits: tuple[float, float] | None = None,
@@ -128,11 +128,8 @@ def _field_colors(mesh, field, cmap, limits):
                 f"a variable of the mesh needed, found {field!r}; it has {', '.join(mesh)}"
             )
         field = mesh[field]
-    values, n = np.asarray(field), mesh.sizes["vertex"]
-    if values.shape not in ((n,), (n, 3)):
-        raise ValueError(
-            f"a value or a colour (3) for each of {n} vertices needed, found {values.shape}"
-        )
+    n = mesh.sizes["vertex"]
+    values = check_rows("field", field, (n,), (n, 3))
     if values.ndim == 2:
         return np.where(np.isfinite(values), np.clip(values, 0, 1), draw.UNKNOWN)
     if values.dtype.kind in "iub":
@@ -141,10 +138,10 @@ def _field_colors(mesh, field, cmap, limits):
 
 
 def field_colors(
-    values: np.ndarray,
+    values: Array,
     cmap: str | Colormap | None = None,
     limits: tuple[float, float] | None = None,
-) -> np.ndarray:
+) -> Array:
     """Return colours ``(n, 3)`` of numbers ``(n,)``; see :func:`surface`.
 
     Examples
@@ -307,9 +304,7 @@ def modes(
     return ModesMesh(geometry, material, scores=[0.0] * len(deformation), frustumCulled=False)
 
 
-def mode_table(
-    mean: np.ndarray, T: np.ndarray, deformation: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def mode_table(mean: Array, T: Array, deformation: Array) -> tuple[Array, Array]:
     """Return a texture (rows, 2048, 4) of displacements and normal changes, and `bends` (c,).
 
     The change of a normal is the derivative of the sum of triangle normals by the score, relative
@@ -340,7 +335,7 @@ def mode_table(
 
 
 def points(
-    positions: xr.Dataset | Mapping[str, np.ndarray] | np.ndarray,
+    positions: xr.Dataset | Mapping[str, Array] | Array,
     color: str = LANDMARK,
     *,
     radius: float | None = None,
@@ -404,7 +399,7 @@ def _name(text, position, height, *, hidden=True):
 
 
 def correspondence(
-    pair: xr.Dataset | xr.DataTree | np.ndarray,
+    pair: xr.Dataset | xr.DataTree | Array,
     source: xr.Dataset | str,
     target: xr.Dataset | str,
     *,
@@ -448,9 +443,8 @@ def correspondence(
     """
     if isinstance(pair, xr.DataTree):
         for name in (source, target):
-            if name not in pair["coarse"].children:
-                raise ValueError(f"two shapes of the study needed, found {name!r}")
-        match = latent_match(pair, source, target, dense=False)
+            check_choice("shape", name, pair["coarse"].children)
+        match = latent_match(pair, source, target, full=False)["match"].values
         (X, S), (Y, T) = (study_surface(pair, name) for name in (source, target))
     else:
         if isinstance(pair, xr.Dataset):

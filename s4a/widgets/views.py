@@ -5,12 +5,12 @@ gets a still picture of the surface at every change.
 """
 
 from typing import Any
-from uuid import uuid4
 
 import anywidget
 import numpy as np
 import traitlets
 
+from s4a.schema import Array
 from s4a.show.browser import (
     CHART,
     SCENE,
@@ -20,6 +20,7 @@ from s4a.show.browser import (
     palette,
     to_bytes,
 )
+from s4a.show.charts import reach
 from s4a.show.draw import (
     SIGNED,
     checkerboard,
@@ -35,7 +36,7 @@ SIZE = (460, 360)  # pixels of a still picture
 MARK = (0.9, 0.6, 0.0)  # colour of a marked point
 
 
-def extent(points: np.ndarray) -> float:
+def extent(points: Array) -> float:
     """Return the diagonal of the bounding box.
 
     Examples
@@ -59,24 +60,6 @@ def round_down(x: float) -> float:
     """
     power = 10.0 ** np.floor(np.log10(x))
     return float(power * max(m for m in (1, 2, 5) if m * power <= x * (1 + 1e-9)))
-
-
-def signed_limit(values: np.ndarray) -> float:
-    """Return the end of the colour scale of a signed function ``(n,)``: the 99 % quantile of |f|.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.widgets.views import signed_limit
-    >>> signed_limit(np.array([-2.0, 2.0]))
-    2.0
-    """
-    return float(np.quantile(np.abs(values), 0.99))
-
-
-def camera_group() -> str:
-    """Return a unique name: the views of one panel share it, and so rotate together."""
-    return uuid4().hex
 
 
 class View(anywidget.AnyWidget):
@@ -183,9 +166,9 @@ class Scene(View):
 
     def show(
         self,
-        points: np.ndarray,
-        triangles: np.ndarray,
-        colors: np.ndarray | None = None,
+        points: Array,
+        triangles: Array,
+        colors: Array | None = None,
         title: str | None = None,
     ) -> None:
         """Show a surface ``(n, 3)``, ``(m, 3)`` with colours ``(n, 3)``, and remove all marks."""
@@ -203,9 +186,9 @@ class Scene(View):
 
     def paint(
         self,
-        colors: np.ndarray | None,
+        colors: Array | None,
         bar: dict | None = None,
-        coordinates: np.ndarray | None = None,
+        coordinates: Array | None = None,
         cell: float = 0.0,
     ) -> None:
         """Set the colours of the vertices, and optionally a checkerboard over them.
@@ -226,9 +209,9 @@ class Scene(View):
             self._send_colors(colors, coordinates, cell)
         self.draw_still()
 
-    def paint_function(self, values: np.ndarray, label: str, limit: float | None = None) -> None:
-        """Colour a signed function ``(n,)`` from -`limit` to `limit` (:func:`signed_limit`)."""
-        limit = signed_limit(values) if limit is None else limit
+    def paint_function(self, values: Array, label: str, limit: float | None = None) -> None:
+        """Colour a signed function ``(n,)`` from -`limit` to `limit`, the 99 % quantile."""
+        limit = reach(values, 0.99) if limit is None else limit
         self.paint(signed_colors(values, limit), color_scale(SIGNED, -limit, limit, label))
 
     def _send_colors(self, colors, coordinates, cell):
@@ -239,7 +222,7 @@ class Scene(View):
         self.cell = 0.0 if coordinates is None else float(cell)
 
     def mark(
-        self, points: np.ndarray, colors: np.ndarray | tuple = (MARK,), radius: float | None = None
+        self, points: Array, colors: Array | tuple = (MARK,), radius: float | None = None
     ) -> None:
         """Mark points ``(p, 3)`` by spheres of one colour, or of one colour each.
 
@@ -255,11 +238,11 @@ class Scene(View):
 
     def connect(
         self,
-        link: np.ndarray,
+        link: Array,
         text: str,
-        values: np.ndarray | None = None,
+        values: Array | None = None,
         *,
-        back: np.ndarray | None = None,
+        back: Array | None = None,
         color: tuple = (),
     ) -> None:
         """Let the browser mark the match of a picked vertex on the other view of the group.
@@ -286,9 +269,7 @@ class Scene(View):
             self.link_back = b"" if back is None else to_bytes(back, "int32")
             self.link = to_bytes(link, "int32")
 
-    def overlay(
-        self, points: np.ndarray | None = None, triangles: np.ndarray | None = None
-    ) -> None:
+    def overlay(self, points: Array | None = None, triangles: Array | None = None) -> None:
         """Show a second, translucent surface; None removes it."""
         with self.hold_sync():
             self.ghost_corner = b"" if triangles is None else to_bytes(triangles, "uint32")
@@ -323,7 +304,7 @@ def plain(value: object) -> object:
     """
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
+    if isinstance(value, list | tuple | Array):
         return [plain(item) for item in value]
     value = value.item() if isinstance(value, np.generic) else value
     return None if isinstance(value, float) and not np.isfinite(value) else value
@@ -370,7 +351,7 @@ class Chart(anywidget.AnyWidget):
             self.answer = -1
             self.spec = plain({"kind": kind, **spec})
 
-    def matrix(self, values: np.ndarray, limit: float = 1.0, **spec: Any) -> None:
+    def matrix(self, values: Array, limit: float = 1.0, **spec: Any) -> None:
         """Draw a functional map ``(rows, columns)`` with colours from -`limit` to `limit`."""
         rows, columns = np.shape(values)
         with self.hold_sync():

@@ -72,7 +72,7 @@ def test_a_training_set_has_meshes_labels_landmarks_and_a_split(study, meshes, t
 
 
 def test_wrong_options_are_refused(study, tmp_path):
-    with pytest.raises(ValueError, match=r"format must be one of ply, .* found 'stl'"):
+    with pytest.raises(ValueError, match=r"format must be one of 'ply', .* found 'stl'"):
         write_registered(study, tmp_path, format="stl")
     with pytest.raises(ValueError, match="a registered study is needed"):
         write_registered(study.drop_nodes("registration"), tmp_path)

@@ -227,7 +227,7 @@ def test_samples_have_the_drawn_scores(simulated):
     )
     moved = np.tensordot(drawn["score"].values[0], simulated[0]["pca"]["deformation"].values[:3], 1)
     assert drawn["sample_1"]["position"].values == pytest.approx(template + moved, abs=1e-6)
-    with pytest.raises(ValueError, match="a number from 1 to 29; found 30"):
+    with pytest.raises(ValueError, match="an integer of at most 29"):
         statistics.sample(simulated[0], 2, n_components=30)
 
 
@@ -534,7 +534,7 @@ def test_a_test_that_can_find_nothing_says_so(twelve, caplog):
 @pytest.mark.parametrize("n", [-1, 0, 10**22])
 def test_a_number_of_permutations_that_makes_no_test_is_refused(n, twelve):
     for test in (statistics.group_test, statistics.group_map, statistics.classify):
-        with pytest.raises(ValueError, match=f"a number from 1 to 10000000; found {n}"):
+        with pytest.raises(ValueError, match="n_permutations must be an integer of at"):
             test(*twelve, n_permutations=n)
 
 
@@ -571,7 +571,7 @@ def test_groups_of_unequal_variance_are_reported_and_sign_flips_hold_the_level(c
     assert "variance differs" not in caplog.text
     statistics.group_test(study, x, n_permutations=19)
     assert "variance differs (0.0: " in caplog.text
-    with pytest.raises(ValueError, match="variances must be 'equal' or 'unequal'"):
+    with pytest.raises(ValueError, match="variances must be one of 'equal', 'unequal'"):
         statistics.group_test(study, x, variances="welch")
 
 

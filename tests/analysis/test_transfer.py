@@ -286,9 +286,9 @@ def test_interpolation_is_exact_for_linear_functions_and_walls_are_not_crossed()
 
 def test_wrong_sources_targets_and_lengths_are_refused(study, meshes):
     label = meshes["brain_01"]["label"].values
-    with pytest.raises(ValueError, match="5000 vertices of the source; found shape \\(7,\\)"):
+    with pytest.raises(ValueError, match=r"5000 vertices, shape .5000,.; found shape \(7,\)"):
         transfer_labels(study, label[:7])
-    with pytest.raises(ValueError, match="no shape 'brain_9' in the study; it has brain_01"):
+    with pytest.raises(ValueError, match=r"must be one of 'brain_01', .*; found 'brain_9'"):
         transfer_labels(study, label, targets=["brain_9"])
     with pytest.raises(ValueError, match="a registered study is needed"):
         transfer_labels(study.drop_nodes("registration"), label)
@@ -549,7 +549,7 @@ def test_labels_are_numbered_as_in_the_file_and_dropped_vertices_have_the_neares
     assert (label[1:21] == 2).all()
     assert (label[21:] == (X[:, 2] > 0) + 1).all()
     assert (labels_of_mesh(label, mesh) == height).all()
-    with pytest.raises(ValueError, match=r"321 labels, .* found shape \(300,\)"):
+    with pytest.raises(ValueError, match=r"each of the 321 vertices .* found shape \(300,\)"):
         labels_of_mesh(height, mesh)
 
 

@@ -394,7 +394,7 @@ def test_what_is_no_surface_is_refused(triangles, message):
 def test_any_heap_of_triangles_becomes_a_manifold_or_an_error():
     rng = np.random.default_rng(0)
     manifolds = 0
-    for i in range(150):
+    for i in range(60):
         n, m = rng.integers(3, 12), rng.integers(1, 40)
         X = (
             rng.normal(size=(n, 3))
@@ -409,7 +409,7 @@ def test_any_heap_of_triangles_becomes_a_manifold_or_an_error():
             continue
         assert counts["genus"] >= 0
         manifolds += 1
-    assert manifolds > 100
+    assert manifolds > 40
 
 
 def shuffled(X, T, seed=0):

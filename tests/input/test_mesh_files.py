@@ -60,7 +60,7 @@ def test_scalars_are_written_where_the_format_holds_them(tmp_path):
         np.testing.assert_array_equal(arrays["height"], height)
     with pytest.raises(ValueError, match=r"cannot hold values"):
         write_mesh(tmp_path / "m.stl", X, T, height=height)
-    with pytest.raises(ValueError, match=r"each of 5 vertices"):
+    with pytest.raises(ValueError, match=r"each of the 5 vertices"):
         write_mesh(tmp_path / "m.ply", X, T, height=height[:3])
 
 

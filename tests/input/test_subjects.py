@@ -256,7 +256,7 @@ def test_the_command_refuses_what_makes_no_test_and_says_a_warning_once(folder, 
     command = ["statistics", str(folder / "study"), "--out", str(folder / "few")]
     for n in ("-1", "0", str(10**9)):
         assert cli.main([*command, "--group", "sex", "--permutations", n]) == 2
-        assert f"a number from 1 to 10000000; found {n}" in capsys.readouterr().err
+        assert "--permutations must be an integer of at" in capsys.readouterr().err
     caplog.clear()
     flags = ["--group", "sex", "--covariates", "score", "--permutations", "9"]
     assert cli.main([*command, *flags, "--variances", "unequal"]) == 0

@@ -81,7 +81,7 @@ def test_the_heat_kernel_around_a_landmark_is_that_of_the_plane_at_short_times(s
     Phi, area, ev, X, _ = shape
     t = 4 * np.log(10) / ev[-1]
     kernel = np.exp(-t * ev)
-    heat = fmap.landmark_signature(Phi, kernel[None], np.array([100]))[:, 0]
+    heat = fmap.signature(Phi, kernel[None], np.array([100]))[:, 0]
     assert area @ heat == pytest.approx(1)  # heat is kept
     assert heat[100] == pytest.approx(1 / (4 * np.pi * t), rel=0.5)
     assert np.linalg.norm(X - X[100], axis=1)[np.argmax(heat)] < 0.05 * np.ptp(X, axis=0).max()

@@ -122,11 +122,11 @@ def test_the_landmark_fit_finds_the_signs_of_the_eigenfunctions(shape, permuted)
 
 def test_the_landmark_fit_is_the_least_squares_solution_of_its_energy(shape):
     Phi, area, eigenvalue, X = shape
-    k, commute = 6, 1e-2
+    k, commute = 6, fmap.LAPLACIAN
     landmark, other = farthest_points(X, 4), farthest_points(X, 9)[5:]
     ev, ev_target = eigenvalue[:k], 1.3 * eigenvalue[:k]
     source, target = (basis(Phi[:, :k], area, values) for values in (ev, ev_target))
-    C = fmap.fmap_from_landmarks(source, target, landmark, other, commute=commute)
+    C = fmap.fmap_from_landmarks(source, target, landmark, other)
     F = fmap.landmark_coefficients(Phi[:, :k], fmap.heat_filter(ev, ev_target, n=8), landmark)
     G = fmap.landmark_coefficients(Phi[:, :k], fmap.heat_filter(ev_target, ev, n=8), other)
     F, G = F / np.linalg.norm(F, axis=0), G / np.linalg.norm(G, axis=0)

@@ -55,7 +55,9 @@ def test_the_constant_mode_does_not_count(norm):
 
 
 def test_an_unknown_norm_is_refused_with_those_there_are():
-    with pytest.raises(ValueError, match="h2, h1, frobenius, h2_image, h2_both; found 'l2'"):
+    with pytest.raises(
+        ValueError, match="'h2', 'h1', 'frobenius', 'h2_image', 'h2_both'; found 'l2'"
+    ):
         median.distance_to_identity(np.eye(3)[None], EIGENVALUES, "l2")
 
 

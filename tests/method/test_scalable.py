@@ -88,5 +88,5 @@ def test_the_result_does_not_depend_on_position_and_size():
 
 
 def test_too_many_eigenpairs_are_refused():
-    with pytest.raises(ValueError, match="below the number of samples"):
+    with pytest.raises(ValueError, match="k must be an integer of at most"):
         reduce(synthetic.sphere(500), n_samples=50, k=80)

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from paths import DOCS, ROOT
-from small import small_brains, small_pictures, small_searches
+from small import small_analyses, small_brains, small_pictures, small_searches
 
 import s4a
 from s4a.geometry.mesh import as_arrays
@@ -34,20 +34,12 @@ def value_of(code, names):
 def small(tmp_path, monkeypatch):
     """A folder, in which brains and low resolutions have at most so many vertices."""
 
-    def limited(function):
-        def call(*args, **options):
-            least = {"n_coarse": min(options["n_coarse"], 250)} if "n_coarse" in options else {}
-            return function(*args, **options | least)
-
-        return call
-
     monkeypatch.chdir(tmp_path)
     matplotlib.use("agg")
-    small_brains(monkeypatch.setattr, 20, 800)
-    small_pictures(monkeypatch.setattr)
+    small_brains(monkeypatch.setattr, 14, 800)
+    small_pictures(monkeypatch.setattr, pages=(40, 32))
     small_searches(monkeypatch.setattr)
-    for name in ("analyse", "match_pair", "register_pairs"):
-        monkeypatch.setattr(s4a, name, limited(getattr(s4a, name)))
+    small_analyses(monkeypatch.setattr, 250)
 
 
 def test_every_cell_of_the_gallery_runs_and_shows_a_picture(small):
@@ -81,8 +73,7 @@ def test_every_recipe_is_a_question_and_runs_in_at_most_fifteen_lines(page, smal
         exec(code, names)
 
 
-def test_the_tutorial_finds_the_simulated_group_difference(small, monkeypatch):
-    small_brains(monkeypatch.setattr, 14, 800)
+def test_the_tutorial_finds_the_simulated_group_difference(small):
     names = {}
     for code in cells("tutorial.md"):
         exec(code, names)
@@ -105,7 +96,7 @@ def test_the_quickstart_of_readme_prints_what_it_shows(tmp_path, monkeypatch, ca
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A folder with what the pages name, where analyses take small options by default."""
-    shapes = s4a.synthetic.brains(7, 600)["original"]
+    shapes = s4a.synthetic.brains(7, 400)["original"]
     meshes = [as_arrays(node.to_dataset()) for node in shapes.children.values()]
     for name in ("heads", "marks"):
         (tmp_path / name).mkdir()
@@ -118,7 +109,7 @@ def folder(tmp_path, monkeypatch):
     rows = [f"head_{i},{'abc'[i % 2]},{20 + i * i}" for i in range(6)]
     (tmp_path / "subjects.csv").write_text("\n".join(["shape,group,age", *rows]) + "\n")
     monkeypatch.chdir(tmp_path)
-    small = {"n_coarse": 200, "k_init": 8, "k": 12}
+    small = {"n_coarse": 120, "k_init": 8, "k": 12}
     analyse, match_pair = s4a.analyse, s4a.match_pair
     monkeypatch.setattr(s4a, "analyse", lambda *a, **o: analyse(*a, **small, n_pairs=10, **o))
     monkeypatch.setattr(s4a, "match_pair", lambda *a, **o: match_pair(*a, **small | o))

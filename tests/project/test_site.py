@@ -16,6 +16,11 @@ nbformat = pytest.importorskip("nbformat")
 for needed in ("furo", "latex2mathml", "myst_nb", "nbconvert", "sphinx"):
     pytest.importorskip(needed)
 slides = script(DOCS / "slides.py")
+# without the grammar of addresses that jsonschema would make, which takes seconds
+SPHINX = """import sys
+sys.modules["rfc3987_syntax"] = None
+from sphinx.cmd.build import main
+sys.exit(main(sys.argv[1:]))"""
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +28,7 @@ def site(tmp_path_factory):
     """The folder of the pages, built without running the lessons."""
     out = tmp_path_factory.mktemp("site")
     options = ["-q", "-W", "--keep-going", "-b", "html", "-d", str(out / "doctrees")]
-    command = [sys.executable, "-m", "sphinx", *options, str(DOCS), str(out / "html")]
+    command = [sys.executable, "-c", SPHINX, *options, str(DOCS), str(out / "html")]
     env = os.environ | {"S4A_DOCS": "off"}
     run = {"env": env, "cwd": ROOT, "capture_output": True, "text": True, "check": False}
     found = subprocess.run(command, **run)
@@ -86,7 +91,10 @@ def shown(cells, folder):
 
 
 NAMES = "drawn = pictured = framed = html_of = tubes = templates = render = None"
-SMALL = "import s4a\nstudy = s4a.synthetic.example_study()"
+SMALL = """import s4a
+from s4a.show import panel_page
+panel_page.N_VALUES = 3  # recorded values of a slider
+study = s4a.open_study({study!r})"""
 SCENE = (
     "from s4a.widgets import threejs\nthreejs.renderer(threejs.surface(study['original/brain_01']))"
 )
@@ -103,12 +111,13 @@ HEAD = '<!DOCTYPE html><meta charset="utf-8"><link rel="icon" href="data:,"><tit
 
 
 def test_panels_of_a_page_work_without_a_kernel_and_are_as_tall_as_what_is_in_them(
-    browser, tmp_path
+    browser, study_folder, tmp_path
 ):
     offline = benchmark("offline")
     # a cell may use the names of what shows panels
+    small = SMALL.format(study=str(study_folder))
     *scene, median, panels = shown(
-        [NAMES, SMALL, SCENE, "s4a.widgets.Median(study)", EXPLORE], tmp_path
+        [NAMES, small, SCENE, "s4a.widgets.Median(study)", EXPLORE], tmp_path
     )
     assert any("A scene" in part for part in scene)
     (tmp_path / "page.html").write_text(f"{HEAD}{panels}", encoding="utf-8")

@@ -163,7 +163,7 @@ def test_a_film_of_one_rotation_shows_every_side(tmp_path, ending):
     "name, options, message",
     [
         ("a.jpg", {}, r"\.png, found a.jpg"),
-        ("a.png", {"width": 3841}, "from 100 to 3840, found 3841"),
+        ("a.png", {"width": 3841}, "an integer of at most 3840"),
         ("a.png", {"mode": 9}, "mode needs whole numbers from 1 to 3, found 9"),
         ("a.png", {"mode": 0}, "mode needs whole numbers from 1 to 3, found 0"),
     ],

@@ -12,6 +12,7 @@ from s4a import synthetic
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.schema import dataset
 from s4a.show import draw, page
+from s4a.show.charts import svg, variance
 from s4a.show.surfaces import mode_limits
 
 pytestmark = pytest.mark.usefixtures("no_pictures_in_module")
@@ -292,8 +293,9 @@ def test_of_many_modes_the_page_holds_the_first(study, monkeypatch):
     assert "the first 2 modes" in html
 
 
-def test_the_page_is_the_same_every_time(study, html):
+def test_the_page_and_its_charts_are_the_same_every_time(study, html):
     assert page.study_html(study, title="Seven <ellipsoids>") == html
+    assert svg(variance([0.7, 0.3])) == svg(variance([0.7, 0.3]))
 
 
 @pytest.mark.parametrize(
@@ -335,4 +337,5 @@ def test_modes_that_could_not_be_are_explained(study):
     del part["pca"]
     part["report"].attrs["no_modes"] = "three shapes are needed <found 2>"
     del part["coarse"], part["registration"]
-    assert "three shapes are needed &lt;found 2&gt;" in page.study_html(part)
+    missing = page.study_html(part).split("Missing:")[1:]
+    assert any("three shapes are needed &lt;found 2&gt;" in text[:400] for text in missing)

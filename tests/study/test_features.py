@@ -64,7 +64,7 @@ def test_a_field_is_standard_at_both_resolutions_and_unknown_values_count_as_the
     ("given", "text"),
     [
         ({}, "at least one field"),
-        ({"a": np.ones(3)}, "a number for each of the 1500 vertices"),
+        ({"a": np.ones(3)}, "a value for each of the 1500 vertices"),
         ({"a": np.full(1500, np.inf)}, "finite numbers"),
         ({"a": np.full(1500, np.nan)}, "NaN everywhere"),
         ({"a": "nowhere.npy"}, "nowhere.npy"),

@@ -1,5 +1,6 @@
-"""Worker processes use memory again that their arrays freed."""
+"""Worker processes are used again, and use memory again that their arrays freed."""
 
+import os
 import platform
 
 import numpy as np
@@ -27,6 +28,12 @@ def faults_of_arrays(_):
 def test_a_worker_uses_the_memory_of_an_array_for_the_next():
     for _, *others in workers(2)(delayed(faults_of_arrays)(i) for i in range(2)):
         assert np.median(others) < SIZE / HUGE_PAGE / 2
+
+
+def test_the_next_call_uses_the_same_processes():
+    ways = {}, {"return_as": "generator"}
+    pids = [set(workers(2, **way)(delayed(os.getpid)() for _ in range(8))) for way in ways]
+    assert len(pids[0] | pids[1]) <= 2
 
 
 def test_processes_are_limited_to_cores_and_tasks(monkeypatch, caplog):

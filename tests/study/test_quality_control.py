@@ -128,14 +128,18 @@ def test_a_run_can_stop_at_flagged_shapes_before_its_long_stages(mixed, tmp_path
         analyse(mixed, quality_control="stop", include_flagged=True, **OPTIONS)
 
 
-def test_without_quality_control_all_shapes_are_in_everything_and_findings_are_warnings(mixed):
+def test_without_quality_control_all_shapes_are_in_everything_and_findings_are_warnings(
+    mixed, tmp_path
+):
     four = {name: mixed[name] for name in ("a_metre", "brain_01", "brain_02", "brain_03")}
-    study = analyse(four, preset="paper", **OPTIONS)
+    study = analyse(four, preset="paper", store=tmp_path, **OPTIONS)
+    assert not list(tmp_path.glob("network/descriptor*")) + list(tmp_path.glob("network/compar*"))
     assert study["latent"]["shape"].values.tolist() == study["pca"]["shape"].values.tolist()
     assert study["latent"]["shape"].values.tolist() == list(four)
     report = study["report"].to_dataset().sel(shape="a_metre")
     assert "flagged" not in study["report"]["status"].values
     assert "unit" in report["warning_kinds"].item()
+    assert "not detected" in study["report"].attrs["remarks"]
     assert excluded_of(study["registration"].to_dataset()) == left_out(study) == []
     assert statistics.with_flagged(study)["pca"]["score"].equals(study["pca"]["score"])
 

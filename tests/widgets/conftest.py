@@ -116,15 +116,22 @@ def offline(browser):
 
 @pytest.fixture
 def show(offline, tmp_path):
-    """Open a saved page, or the page of a panel, which is closed; no page may have an error."""
+    """Open a saved page, or the page of a panel, which is closed; no page may have an error.
+
+    Of each slider of a panel `n_values` values are recorded, which takes most of the time.
+    """
     from browsing import DRAWN, watched
+
+    from s4a.show import panel_page
 
     pages, errors = [], []
 
-    def opened(what, context=offline, *, drawn=True, **options):
+    def opened(what, context=offline, *, drawn=True, n_values=3, **options):
         if hasattr(what, "save_html"):
             panel, what = what, tmp_path / f"panel_{len(pages)}.html"
-            panel.save_html(what, **options)
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(panel_page, "N_VALUES", n_values)
+                panel.save_html(what, **options)
             panel.close()
         page = watched(context.new_page(), errors)
         pages.append(page)

@@ -1,7 +1,7 @@
 """S4A in a Python that lacks what a kernel in the browser (Pyodide) lacks.
 
-``in_browser.py FOLDER`` opens the study of the folder, every panel and the cells of a lesson, makes
-and analyses three brains, and says as JSON what was done.
+``in_browser.py FOLDER STRUCTURES`` opens the studies of the folders, every panel and the cells of a
+lesson, makes and analyses three brains, and says as JSON what was done.
 
 Pyodide has NumPy, SciPy, h5py, xarray, scikit-image, matplotlib and scikit-learn. It has no libigl,
 robust_laplacian, fpsample and psutil, and of Python itself no threads and some modules less.
@@ -70,11 +70,10 @@ def run_lesson(name, study):
     return path.stem
 
 
-def panels_of(study):
-    """Every panel and its title; those of a comparison, a test and structures are of small ones."""
+def panels_of(study, several):
+    """Every panel and its title; those of a comparison and a test are of small ones."""
     from s4a import compare, statistics, synthetic, widgets
-    from s4a_morphometrics import Region
-    from s4a_morphometrics.synthetic import example_structures
+    from s4a_morphometrics import Region, open_structures
 
     for title, kind in widgets.explore.PANELS.items():
         yield title, kind(study)
@@ -84,7 +83,7 @@ def panels_of(study):
         "Maps",
         widgets.Maps(study, statistics.regression(study, numbers, of="normal", n_permutations=15)),
     )
-    yield "Structures", widgets.Structures(example_structures())
+    yield "Structures", widgets.Structures(open_structures(several).load())
     pair = [node.to_dataset() for node in synthetic.brains(2, 300)["original"].children.values()]
     options = {"n_coarse": 200, "k": 20, "k_init": 10, "n_geodesic": 50}
     compared = compare(*pair, methods=["kNN", "RE-MATCH"], keep=True, **options)
@@ -116,7 +115,7 @@ def main():
 
     done = {"panels": []}
     with s4a.open_study(sys.argv[1]) as study:
-        for title, panel in panels_of(study):
+        for title, panel in panels_of(study, sys.argv[2]):
             for control in widgets_in(panel):
                 if hasattr(control, "options"):  # the last of its list, which is computed then
                     control.index = len(control.options) - 1

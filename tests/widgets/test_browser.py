@@ -788,12 +788,6 @@ def test_full_resolution_is_drawn_once_after_a_drag(show, study):
     assert waited >= 800
 
 
-@pytest.fixture
-def few_values(monkeypatch):
-    """Record three values of a slider instead of 24."""
-    monkeypatch.setattr(panel_page, "N_VALUES", 3)
-
-
 @pytest.fixture(scope="module")
 def study_page(study, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
@@ -933,7 +927,7 @@ def test_the_axes_of_a_matrix_number_its_cells_and_nothing_overlaps(show, map_pa
     assert max(box["x"] + box["width"] for box in boxes) <= width
 
 
-def test_the_page_of_the_median_ranks_by_the_selected_operator(show, study, few_values):
+def test_the_page_of_the_median_ranks_by_the_selected_operator(show, study):
     page = show(widgets.Median(study))
     assert barriers(page) == []
     chosen(page, "operator", "conformal")
@@ -950,7 +944,7 @@ def test_the_page_of_the_median_ranks_by_the_selected_operator(show, study, few_
 
 
 def test_the_page_of_the_spectrum_shows_eigenfunctions_and_reconstructions(show, study):
-    page = show(widgets.Spectrum(study))
+    page = show(widgets.Spectrum(study), n_values=24)
     move(page.locator("#c-index"), 7)
     visible(page, ".s4a-title").filter(has_text="φ7 of brain_01").wait_for()
     canvas = visible(page, VIEW).nth(1)

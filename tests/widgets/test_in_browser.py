@@ -16,11 +16,12 @@ pytest.importorskip("anywidget")
 
 
 @pytest.fixture(scope="module")
-def done(study_folder, tmp_path_factory):
+def done(study_folder, structures_folder, tmp_path_factory):
     """Return the results of the script, run in its own process and temporary folder."""
     place = str(tmp_path_factory.mktemp("browser"))
     environment = os.environ | {"TMPDIR": place, "TEMP": place, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, str(TESTS / "widgets" / "in_browser.py"), str(study_folder)]
+    command = [sys.executable, str(TESTS / "widgets" / "in_browser.py")]
+    command += [str(study_folder), str(structures_folder)]
     run = subprocess.run(
         command, env=environment, cwd=place, capture_output=True, text=True, check=False
     )

@@ -683,7 +683,7 @@ def test_a_failed_analysis_shows_the_error(tmp_path):
 
 
 def test_a_cancelled_analysis_ends_and_a_resumed_one_is_not_called_cancelled(tmp_path):
-    panel = Progress(s4a.synthetic.brains(3, 4000, seed=1), tmp_path / "study", n_jobs=1)
+    panel = Progress(s4a.synthetic.brains(3, 500, seed=1), tmp_path / "study", n_jobs=1)
     assert panel.view.disabled, "nothing is there to open"
     panel.stop.click()
     assert panel.state == "cancelled"
