@@ -28,7 +28,7 @@ def few_points():
 
 @pytest.fixture(scope="module")
 def tree():
-    return synthetic.brains(8, 2000, seed=5, n_modes=2)
+    return synthetic.brains(8, 2000, seed=7, n_modes=2)
 
 
 @pytest.fixture(scope="module")

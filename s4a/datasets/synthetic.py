@@ -674,7 +674,7 @@ def example_study() -> xr.DataTree:
     >>> study["registration"].sizes["vertex"], study["pca"].sizes["component"]
     (200, 5)
     """
-    return analyse(brains(6, 200), n_coarse=100, k=10, k_init=6, n_pairs=6)
+    return analyse(brains(6, 200), n_coarse=100, k=10, k_init=6, n_pairs=6, alignment="given")
 
 
 def sphere(n_vertices: int = 2562, radius: float = 1.0) -> xr.Dataset:

@@ -26,7 +26,19 @@ def folder(brain_files, tmp_path_factory):
     """The folder of a study of four brains, from the command line."""
     out = tmp_path_factory.mktemp("scalable") / "study"
     assert (
-        main(["run", *map(str, brain_files), "--out", str(out), "--method", "scalable", *FLAGS])
+        main(
+            [
+                "run",
+                *map(str, brain_files),
+                "--out",
+                str(out),
+                "--method",
+                "scalable",
+                "--template",
+                "brain_01",
+                *FLAGS,
+            ]
+        )
         == 0
     )
     return out
@@ -40,9 +52,15 @@ def sampled(folder):
 
 
 @pytest.fixture(scope="module")
-def paper(brains):
-    """The same as in the paper: nothing is added to it."""
-    return s4a.analyse(brains, method="scalable", preset="paper", **OPTIONS)
+def others():
+    """Four brains."""
+    return s4a.synthetic.brains(4, 1500, seed=2)
+
+
+@pytest.fixture(scope="module")
+def paper(others):
+    """The study of the paper: nothing is added to it."""
+    return s4a.analyse(others, method="scalable", preset="paper", **OPTIONS)
 
 
 def contents_of(study):
@@ -84,9 +102,9 @@ def test_the_low_resolution_is_the_reduced_basis_of_scalable(sampled):
     assert coarse["position"].values == pytest.approx(X)
 
 
-def test_the_paper_on_scalable_is_what_table_2_compares(brains, paper):
+def test_the_paper_on_scalable_is_what_table_2_compares(others, paper):
     names = {"n_coarse": 400, "k_init": 10, "k": 24, "methods": ["SCALABLE"]}
-    result = s4a.compare_collection(brains, preset="paper", **names).isel(algorithm=0)
+    result = s4a.compare_collection(others, preset="paper", **names).isel(algorithm=0)
     assert paper["latent"].attrs["median"] == result["median_shape"].item()
     assert result["distance_to_limit"].values == pytest.approx(
         paper["latent/distance_to_limit"].values, rel=1e-3
@@ -147,8 +165,8 @@ def test_the_commands_take_it(folder, brain_files, sampled, tmp_path, no_picture
     assert 0 < (first != second).mean() < 0.1  # by other functions, to nearly the same places
 
 
-def test_a_new_shape_comes_in_by_local_functions_too(paper, meshes):
-    new = s4a.insert(paper, {"new": meshes["brain_04"]}, compare=False)
+def test_a_new_shape_comes_in_by_local_functions_too(paper, others):
+    new = s4a.insert(paper, {"new": others["original/brain_04"].to_dataset()}, compare=False)
     assert new["coarse/new"].attrs["method"] == "scalable"
     Y = paper["latent/latent_basis"].sel(shape="brain_04").values
     own = new["latent/latent_basis"].values[0]
