@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 from s4a.geometry import mesh as surface
 from s4a.geometry import voronoi
 from s4a.geometry.align import many_farthest_points, without_ties
-from s4a.geometry.closest import closest_point, closest_point_in_star, closest_point_on_triangles
+from s4a.geometry.closest import closest_point, closest_point_in_star
 from s4a.geometry.compiled import robust_laplacian
 from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas, vertex_normals
 from s4a.input.collection import Mesh, as_mesh
@@ -38,7 +38,7 @@ from s4a.seeds import RNG, seed_of
 GL = "install the system's libgl1 and libopengl0, or see `s4a doctor`"
 INITIAL_SHARE = 0.95  # of n_coarse that is sampled first; the rest repairs the topology of cells
 MAX_SHARE = 1.1  # of n_coarse, above which handles are cut instead of adding samples
-MOVED = 1e-4  # of the radius, by which vertices move before the closest triangle is searched
+MOVED = 1e-4  # of the radius: U is computed from vertices moved by less, of which few tie
 _N_CUTS = 3  # attempts to cut handles before samples are added without limit
 
 
@@ -418,12 +418,12 @@ def coarsen(
     if wrap:
         sample = np.full(len(Y), -1)
         cell = cell[_nearest_with_normal(X, T, V, F)]
-    P = without_ties(X, MOVED)  # U has the exact closest point on the triangle found for P
-    triangle, _ = (
-        closest_point(P, Y, C) if sampling == "geodesic" else closest_point_in_star(P, cell, Y, C)
+    P = without_ties(X, MOVED)
+    Q = np.where(sample[:, None] >= 0, P[sample], Y)  # so that a sample is its own closest point
+    triangle, weight = (  # (n,), (n, 3)
+        closest_point(P, Q, C) if sampling == "geodesic" else closest_point_in_star(P, cell, Q, C)
     )
     corner = C[triangle]  # (n, 3)
-    weight = closest_point_on_triangles(X, *(Y[end] for end in corner.T))  # (n, 3)
     if wrap:
         area = vertex_areas(Y, C)
     else:  # U^T a: f and U f have the same integral

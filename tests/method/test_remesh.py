@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from s4a.geometry.mesh import as_arrays, as_dataset, edge_graph, edges, unique_edges, vertex_areas
 from s4a.input.clean import clean
-from s4a.method.remesh import coarsen
+from s4a.method.remesh import MOVED, coarsen
 from s4a.method.spectral import spectrum
 
 
@@ -172,13 +172,13 @@ def test_rows_of_u_are_convex_weights_and_samples_carry_themselves(surface):
     np.testing.assert_allclose(coarse["vertex_area"].sum(), vertex_areas(X, T).sum(), rtol=1e-6)
 
 
-def test_linear_functions_on_a_plane_come_back_exactly_but_where_a_cell_leaves_its_star():
+def test_linear_functions_on_a_plane_come_back_but_where_a_cell_leaves_its_star():
     X, T = plane()
     coarse = coarsen(as_dataset(X, T), n_coarse=300)
     inside = ((X[:, :2] > 0.1) & (X[:, :2] < 0.9)).all(1)
     f = X @ [2.0, -3.0, 1.0] + 5
     error = np.abs(apply_u(coarse, f[coarse["sample_vertex"].values]) - f)
-    assert (error[inside] < 1e-12).mean() > 0.99
+    assert (error[inside] < 4 * MOVED).mean() > 0.99  # the gradient is 3.7, the radius below 1
     assert error.max() < 0.05  # the spacing is 0.06, the gradient 3.6
 
 
