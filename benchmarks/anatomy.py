@@ -1,10 +1,10 @@
-"""Femurs with landmarks, and spleens as a shape model, beside other programs.
+"""Femurs with landmarks, and spleens as a shape model, compared with other programs.
 
 ``anatomy.py femurs``: sixteen raw femurs of the shared data beside the checkout, with six landmarks
 each.  Those of the template are mapped to the other shapes; their distance to those marked there.
 
 ``anatomy.py spleens``: the 32 aligned spleens with which Point2SSM (Adams and Elhabian, ICLR 2024)
-is trained, at 1,024 points of the template, with its measures: Chamfer distance, the mean squared
+is trained, at 1,024 points of the template.  Chamfer distance as in its code: the mean squared
 distance of points to the nearest vertex plus that of vertices to the nearest point; components with
 95 % of the variance; generalization, the mean distance of points of a left-out shape to their
 reconstruction; specificity, that of 1,000 random shapes to the nearest shape.  Its validation and
@@ -34,7 +34,7 @@ from s4a.geometry.align import farthest_points
 from s4a.geometry.closest import closest_point, distance_to_surface, interpolate
 from s4a.geometry.mesh import as_arrays
 
-N_POINTS, SHARE, N_RANDOM = 1024, 0.95, 1000  # of Point2SSM
+N_POINTS, SHARE, N_RANDOM = 1024, 0.95, 1000  # points and share as in Point2SSM
 MEASURES = {
     "femurs": "mean, mm | 90 %, mm | worst shape, mm",
     "spleens": "Chamfer, mm^2 | to the surface, mm | components | generalization, mm "

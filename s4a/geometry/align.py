@@ -118,8 +118,9 @@ def farthest_points(P: Array, k: int) -> Array:
     """Return indices of k farthest-point samples (Euclidean).
 
     The first sample is the point farthest from the mean, and the points are sampled
-    :func:`without_ties`, so the samples depend neither on the numbering nor on the pose.  If there
-    are at most k points, all are returned in their order.
+    :func:`without_ties`, so the samples depend neither on the numbering nor on the pose, except
+    where points are equally far from the mean, as on a mirror-symmetric shape.  If there are at
+    most k points, all are returned in their order.
 
     Parameters
     ----------
