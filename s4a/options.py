@@ -6,6 +6,7 @@ the table of differences from the paper are derived from it.  To add an option, 
 """
 
 import difflib
+import inspect
 import json
 import re
 import textwrap
@@ -39,7 +40,6 @@ def option(
     help: str,
     *,
     group: str,
-    more: str = "",
     choices: tuple[str, ...] = (),
     least: int = 0,
     check: Callable[[Any], Any] | None = None,
@@ -59,11 +59,10 @@ def option(
     default : object
         Default value, unless a preset sets another.
     help : str
-        Short description, for the flag and as first sentence of the docstring.
+        Short description, for the flag and as first sentence of the docstring.  Further sentences
+        are in the docstring of :class:`Options`.
     group : str
         Group under which the command line shows it.
-    more : str
-        Further sentences for the docstring and the page on differences.
     choices : tuple of str
         Valid strings.
     least : int
@@ -228,7 +227,101 @@ class Options:
 
     Parameters
     ----------
-    {options}
+    preset
+        The default, None, uses all additions.  Errors of 'fast' are about a tenth larger
+        (``benchmarks/cheaper.py``).  A value that contradicts the preset is refused.  To change one
+        entry, pass ``Options(**PRESETS['paper'] | {'refine': 'elastic'})``.
+    seed
+        ``rng``, an integer or a ``numpy.random.Generator``, can replace it.
+    label
+        ``"all"`` means every label but 0, see :func:`s4a.read_labels` for the formats.  By default
+        the files are meshes.
+    coordinate_system
+        Files of different systems are converted to the most frequent one if all are known, and
+        refused otherwise (:mod:`s4a.input.coordinates`).  What a file states is never overridden.
+    reflect
+        Mirroring maps x to -x in the coordinates of the file and reverses the triangles, so that
+        left and right shapes get the same chirality.  A column of yes and no needs no value.
+        ``auto`` mirrors the shapes of the rarer chirality, found by pairwise ICP of the shapes and
+        of their mirror images (:func:`s4a.input.chirality.mirrored_shapes`).  ``/report`` says for
+        each shape whether it was mirrored.
+    table
+        The columns are stored in ``/subjects``; :func:`s4a.input.subjects.read_table` describes the
+        format.  Only ``reflect`` and the statistics use the table.  Without a table, the table of
+        an earlier run is kept.
+    landmarks
+        The formats are those of :func:`s4a.input.annotations.read_landmarks`.  Shapes without a
+        file have no landmarks.  Landmarks of two shapes are paired by name.
+        :func:`s4a.with_landmarks` adds landmarks to a mesh in memory.
+    features
+        A file a.sulc or a property of the PLY file are read, too
+        (:func:`s4a.input.annotations.feature_files`).  :func:`s4a.with_features` adds fields to a
+        mesh in memory.
+    method
+        The methods are ReMatching and SCALABLE.  Both give the same nodes and variables, but
+        SCALABLE has no U.  Its coarse vertices are samples, joined by an edge where their cells
+        meet.  ``refined_eigenfunctions`` and ``wrap`` cannot be used with SCALABLE.
+    n_coarse
+        The meshes have between 95 and 110 % of this number, usually 95 %: 5,700 of 6,000, since the
+        rest is for repairs of the topology.  With SCALABLE it is the number of samples.
+    sampling
+        Geodesic samples ignore curvature, and U can then cross thin walls.
+    refined_eigenfunctions
+        U Phi interpolates the eigenfunctions of the coarse mesh.  The refined ones approximate
+        those of the original mesh by one step of inverse iteration.  They are used in eq. 4, in eq.
+        7 and in the smoothing of eq. 8.  ``/coarse`` stores them, 40 MB for 100,000 vertices.
+    n_pairs
+        All pairs are used if there are fewer.
+    alignment
+        The search starts at the principal axes, so its result does not depend on the pose of the
+        files.  A shape that fits others equally well in two poses is flagged.  Landmarks replace
+        the search and the pose from which plain ICP starts.  Use 'given' for aligned data.
+    init
+        Nearest neighbours are found after ICP.  If poses differ a lot, the best of several initial
+        maps is used.
+    initial_refinement
+        The iteration does not change the size of the map.  Single pairs are matched by
+        :func:`s4a.match_pair` (4.1).
+    isometric
+        The maps are then closer to area-preserving, so the energies of eq. 5 are smaller.  In pyFM
+        this is ``isometric`` of ``FMN.zoomout_refine``, which is True by default.
+    n_samples
+        The number must be at least 2 k.  The initial refinement also uses the samples if pose
+        differences are small.
+    dense_iterations
+        Matches between samples alone are only as accurate as the spacing of the samples.  With
+        ``n_samples=0`` all vertices are searched anyway.
+    norm
+        'frobenius' weights all eigenfunctions equally.  'h1' gives fine detail less weight, and
+        'h2' even less.  'h2_image' gives fine detail more weight.  'h2_both' gives fine detail less
+        weight in the domain and more weight in the image.
+        :func:`s4a.method.median.distance_to_identity` has the formulas.
+    keep_iterations
+        They are the nodes of ``/iterations``.  The descriptors of initial maps are in ``/network``.
+        :func:`s4a.match_pair` has the same option for the iterations of ZoomOut.
+    dense_match
+        Unless ``refine="intrinsic"``, this match is one of several initialisations.
+    refine
+        Elastic iterations penalise bending and stretch.  If poses differ a lot, spectral non-rigid
+        ICP comes first (:mod:`s4a.method.spectral_icp`).  With 'spectral_icp' the best of several
+        results is kept.
+    articulated
+        Otherwise one rigid transform applies to the whole shape.
+    full_resolution_iterations
+        They follow ZoomOut on coarse vertices.  Also used when an external mesh is matched to the
+        template.
+    bidirectional
+        It is an option of :func:`s4a.register_pairs`.
+    displacement_alignment
+        With 'initial', eq. 8 holds as printed in the paper.
+    n_projected
+        Vertices near coarse vertices are used.
+    quality_control
+        A flagged shape, such as a mirrored one or one in another unit, is left out of the network
+        and of the modes.  It is registered afterwards, with the results of the others held fixed.
+        With 'stop' the run ends before the long stages.  With 'off' all shapes are in the network
+        and the modes, each can be the median, shapes are not compared with each other, and what
+        cleaning, alignment and registration find are warnings.
 
     Raises
     ------
@@ -249,12 +342,8 @@ class Options:
     # fmt: off
     preset: str | None = computing(None,
         "'paper' switches off all additions to the published method; 'fast' halves the time",
-        choices=("paper", "fast"), pair=True,
-        more="The default, None, uses all additions.  Errors of 'fast' are about a tenth larger "
-        "(``benchmarks/cheaper.py``).  A value that contradicts the preset is refused.  To change "
-        "one entry, pass ``Options(**PRESETS['paper'] | {'refine': 'elastic'})``")
-    seed: int = computing(0, "seed of all random numbers", of="low resolution", pair=True,
-        more="``rng``, an integer or a ``numpy.random.Generator``, can replace it")
+        choices=("paper", "fast"), pair=True)
+    seed: int = computing(0, "seed of all random numbers", of="low resolution", pair=True)
     pattern: str | None = reading(None,
         "read only files whose name matches a pattern, such as '*brain*'")
     components: str | int = reading("largest",
@@ -266,86 +355,51 @@ class Options:
     label: int | str | None = reading(None,
         "extract the surface of this label, or of the union of several (1,2), from label volumes "
         "(NIfTI, MGH, NRRD)",
-        check=check_label, of="cleaning", more='``"all"`` means every label but 0, see '
-        ":func:`s4a.read_labels` for the formats.  By default the files are meshes")
+        check=check_label, of="cleaning")
     coordinate_system: str | None = reading(None,
         "coordinate system of files that state none: RAS, LPS or 'surface RAS, c_ras X Y Z'",
-        of="cleaning", pair=True, more="Files of different systems are converted to the most "
-        "frequent one if all are known, and refused otherwise "
-        "(:mod:`s4a.input.coordinates`).  What a file states is never overridden")
+        of="cleaning", pair=True)
     unit: str | None = reading(None, "unit of files that state none: um, mm, cm, m or in",
         check=check_unit, of="cleaning", pair=True)
     reflect: str | list[str] | None = reading(None,
-        "shapes to mirror: names separated by commas, COLUMN=VALUE of the table, or 'auto'",
-        more="Mirroring maps x to -x in the coordinates of the file and reverses the triangles, so "
-        "that left and right shapes get the same chirality.  A column of yes and no needs no "
-        "value.  "
-        "``auto`` mirrors the shapes of the rarer chirality, found by pairwise ICP of the shapes "
-        "and of their mirror images (:func:`s4a.input.chirality.mirrored_shapes`).  ``/report`` "
-        "says for each shape whether it was mirrored")
+        "shapes to mirror: names separated by commas, COLUMN=VALUE of the table, or 'auto'")
     table: Path | str | None = reading(None,
-        "CSV file with a column 'shape', covariates and groups for the statistics",
-        more="The columns are stored in ``/subjects``; :func:`s4a.input.subjects.read_table` "
-        "describes the format.  Only ``reflect`` and the statistics use the table.  Without a "
-        "table, the table of an earlier run is kept")
+        "CSV file with a column 'shape', covariates and groups for the statistics")
     landmarks: Path | str | None = reading(None,
         "folder of landmark files, named as the shapes, that guide alignment and elastic "
-        "registration",
-        more="The formats are those of :func:`s4a.input.annotations.read_landmarks`.  Shapes "
-        "without a file "
-        "have no landmarks.  Landmarks of two shapes are paired by name.  "
-        ":func:`s4a.with_landmarks` adds landmarks to a mesh in memory")
+        "registration")
     features: str | list[str] | None = reading(None,
         "names of scalar fields that guide registration, separated by commas; the field sulc of "
-        "a.ply is read from a.sulc.npy",
-        more="A file a.sulc or a property of the PLY file are read, too "
-        "(:func:`s4a.input.annotations.feature_files`).  :func:`s4a.with_features` adds fields to "
-        "a mesh in memory")
+        "a.ply is read from a.sulc.npy")
     method: str = network("rematch",
         "low-resolution shapes: remeshed surfaces (rematch) or local functions (scalable)",
         choices=("rematch", "scalable"), section="4.1", see="method/scalable", of="low resolution",
-        pair=True,
-        more="The methods are ReMatching and SCALABLE.  Both give the same nodes and variables, "
-        "but SCALABLE has no U.  Its coarse vertices are samples, joined by an edge where their "
-        "cells meet.  "
-        "``refined_eigenfunctions`` and ``wrap`` cannot be used with SCALABLE")
+        pair=True)
     n_coarse: int = network(N_COARSE, "number of vertices of the low-resolution meshes", least=100,
-        fast=3000, section="4.1", of="low resolution", pair=True,
-        more="The meshes have between 95 and 110 % of this number, usually 95 %: 5,700 of 6,000, "
-        "since the rest is for repairs of the topology.  With SCALABLE it is the number "
-        "of samples")
+        fast=3000, section="4.1", of="low resolution", pair=True)
     sampling: str = network("normals",
         "samples of the low-resolution meshes: farthest points in position and normal (normals), "
         "or, as in ReMatching, along the surface, with U from closest points in space (geodesic)",
         choices=("normals", "geodesic"), section="4.1, step 1", see="method/remesh",
-        of="low resolution", pair=True,
-        more="Geodesic samples ignore curvature, and U can then cross thin walls")
+        of="low resolution", pair=True)
     wrap: bool = network(False, "wrap the shapes in a watertight surface before remeshing",
         of="low resolution")
     refined_eigenfunctions: bool = network(False,
         "use refined full-resolution eigenfunctions instead of U Phi", paper=False,
         section="eq. 4, 7, 8", instead="$U \\phi$", see="method/refined_eigenfunctions",
-        of="low resolution", pair=True,
-        more="U Phi interpolates the eigenfunctions of the coarse mesh.  The refined ones "
-        "approximate those of the original mesh by one step of inverse iteration.  They are used "
-        "in eq. 4, in eq. 7 and in the smoothing of eq. 8.  ``/coarse`` stores them, 40 MB for "
-        "100,000 vertices")
+        of="low resolution", pair=True)
     k_init: int = network(20, "size of the initial functional maps", least=4, section="5.1",
         pair=True)
     k: int = network(100, "size of the refined functional maps", least=4, section="5.1",
         of="low resolution", pair=True)
     n_pairs: int = network(500, "number of pairs in the network, each with maps in both directions",
-        least=1, section="5.1", more="All pairs are used if there are fewer")
+        least=1, section="5.1")
     alignment: str = network("search",
         "rigid alignment: the best of several results of ICP in position and normal (search), "
         "plain ICP from the pose of the files (icp), or that pose, with centroids aligned (given)",
         choices=("search", "icp", "given"), paper="icp", section="4.1, step 2",
         instead="ICP from the pose of the files", see="method/alignment", of="initial maps",
-        pair=True,
-        more="The search starts at the principal axes, so its result does not depend on the pose "
-        "of the files.  A shape that fits others equally well in two poses is flagged.  Landmarks "
-        "replace the search and the pose from which plain ICP starts.  Use 'given' for aligned "
-        "data")
+        pair=True)
     init: str = network("dense",
         "initial maps from nearest neighbours of all vertices (dense), from 10 landmarks "
         "(landmarks), or as in pyFM from wave kernels of the shapes and of these landmarks "
@@ -353,17 +407,13 @@ class Options:
         choices=("dense", "landmarks", "wave_kernels"), paper="landmarks",
         section="4.1, steps 3 and 4",
         instead="initial map fitted to 10 landmarks", see="method/initial_map", of="initial maps",
-        pair=True,
-        more="Nearest neighbours are found after ICP.  If poses differ a lot, the best of several "
-        "initial maps is used")
+        pair=True)
     initial_refinement: str = network("always",
         "refine initial maps by one ZoomOut iteration: in the network and in s4a.match_pair "
         "(always), in the network only (network), or never",
         choices=("always", "network", "never"), paper="network", section="4.2",
         instead="one ZoomOut iteration before Consistent ZoomOut", see="method/initial_map",
-        of="initial maps", given_as="never".__ne__, pair=True,
-        more="The iteration does not change the size of the map.  Single pairs are matched by "
-        ":func:`s4a.match_pair` (4.1)")
+        of="initial maps", given_as="never".__ne__, pair=True)
     step: int = network(5, "eigenfunctions added in each iteration of ZoomOut", least=1,
         section="4.2", of="Consistent ZoomOut", pair=True)
     n_latent: int | None = network(None, "dimension of the latent space; by default k", least=2,
@@ -376,68 +426,48 @@ class Options:
     isometric: bool = network(False,
         "before each latent basis of Consistent ZoomOut, replace both maps of a pair by the more "
         "orthogonal one and its transpose, as pyFM does", section="4.2", see="method/latent",
-        of="Consistent ZoomOut",
-        more="The maps are then closer to area-preserving, so the energies of eq. 5 are smaller.  "
-        "In pyFM this is ``isometric`` of ``FMN.zoomout_refine``, which is True by default")
+        of="Consistent ZoomOut")
     n_samples: int = network(N_SAMPLES,
         "number of farthest-point samples that Consistent ZoomOut matches; 0 for all vertices",
         paper=0, fast=500, section="eq. 3", instead="for all vertices in every iteration",
-        see="method/latent", of="initial maps",
-        more="The number must be at least 2 k.  The initial refinement also uses the samples if "
-        "pose differences are small")
+        see="method/latent", of="initial maps")
     dense_iterations: int = network(4,
         "final Consistent ZoomOut iterations that also search the vertices around each match",
-        paper=0, fast=0, section="eq. 3", see="method/latent", of="Consistent ZoomOut",
-        more="Matches between samples alone are only as accurate as the spacing of the samples.  "
-        "With ``n_samples=0`` all "
-        "vertices are searched anyway")
+        paper=0, fast=0, section="eq. 3", see="method/latent", of="Consistent ZoomOut")
     norm: str = network("h2",
         "norm that selects the median shape: the shape difference with the smallest norm",
         choices=("h2", "h1", "frobenius", "h2_image", "h2_both"), section="eq. 5",
-        of="Consistent ZoomOut",
-        more="'frobenius' weights all eigenfunctions equally.  'h1' gives fine detail less weight, "
-        "and 'h2' even less.  'h2_image' gives fine detail more weight.  'h2_both' gives fine "
-        "detail less weight in the domain and more weight in the image.  "
-        ":func:`s4a.method.median.distance_to_identity` has the formulas")
+        of="Consistent ZoomOut")
     keep_iterations: bool = network(False,
         "store the maps, latent bases and matches of every iteration of Consistent ZoomOut",
-        of="Consistent ZoomOut",
-        more="They are the nodes of ``/iterations``.  The descriptors of initial maps are in "
-        "``/network``.  :func:`s4a.match_pair` has the same option for the iterations of ZoomOut")
+        of="Consistent ZoomOut")
     template: str | None = registration(None,
         "name of the shape to register to; by default the median shape")
     dense_match: str = registration("latent",
         "full-resolution match by the latent bases (eq. 7) or by functional maps (eq. 3 and 4)",
-        choices=("latent", "fmap"), section="4.2",
-        more='Unless ``refine="intrinsic"``, this match is one of several initialisations')
+        choices=("latent", "fmap"), section="4.2")
     refine: str = registration("elastic",
         "refinement of the match: elastic iterations, iterated spectral non-rigid ICP, or none as "
         "in the paper (intrinsic)",
         choices=("elastic", "spectral_icp", "intrinsic"), paper="intrinsic", section="eq. 7, 4",
-        instead="the match as it is", see="method/elastic", of="registration", pair=True,
-        more="Elastic iterations penalise bending and stretch.  If poses differ a lot, spectral "
-        "non-rigid ICP comes first (:mod:`s4a.method.spectral_icp`).  With 'spectral_icp' the best "
-        "of several results is kept")
+        instead="the match as it is", see="method/elastic", of="registration", pair=True)
     articulated: bool = registration(True,
         "if poses differ a lot, spectral non-rigid ICP fits a separate rigid transform to each "
         "part, such as a limb",
-        paper=False, section="eq. 8", see="method/deform", of="registration", pair=True,
-        more="Otherwise one rigid transform applies to the whole shape")
+        paper=False, section="eq. 8", see="method/deform", of="registration", pair=True)
     full_resolution_iterations: int = registration(1,
         "s4a.match_pair and transfer only: ZoomOut iterations that search all source vertices",
         paper=0, section="eq. 4", instead="after ZoomOut on coarse vertices", see="method/register",
-        pair=True, more="They follow ZoomOut on coarse vertices.  Also used when an external mesh "
-        "is matched to the template")
+        pair=True)
     bidirectional: bool = registration(True,
         "transfer only: match pairs in both directions and average the results",
         paper=False, section="6.2", instead="a template registered to a shape",
-        see="study/pair", pair=True, more="It is an option of :func:`s4a.register_pairs`")
+        see="study/pair", pair=True)
     displacement_alignment: str = registration("fitted",
         "rigid alignment to the template before displacements are computed: best fit of the "
         "registered surface (fitted), or the initial alignment (initial)",
         choices=("fitted", "initial"), paper="initial", section="eq. 8",
-        instead="after ICP (4.1, step 2)", see="method/deform", of="registration", pair=True,
-        more="With 'initial', eq. 8 holds as printed in the paper")
+        instead="after ICP (4.1, step 2)", see="method/deform", of="registration", pair=True)
     area_weighted: bool = registration(True,
         "weight vertices by area when displacements are projected onto U Phi", paper=False,
         section="after eq. 8", instead="$(U \\phi)^\\dagger$ as printed", see="method/deform",
@@ -445,7 +475,7 @@ class Options:
     n_projected: int = registration(N_CENTRAL,
         "number of vertices used to project displacements onto U Phi; 0 for all", paper=0,
         section="after eq. 8", instead="on all vertices", see="method/shape", of="projection",
-        pair=True, more="Vertices near coarse vertices are used")
+        pair=True)
     remove_size: bool = registration(False, "align with scaling, so that "
         "displacements do not contain size", of="registration")
     intersections: bool = quality(True,
@@ -454,12 +484,7 @@ class Options:
         "suspect (flagged) shapes, such as mirrored ones, are excluded, the run stops, or "
         "all shapes are used (off)",
         choices=("exclude", "stop", "off"), paper="off", section="4.2", instead="all shapes",
-        see="study/quality_control",
-        more="A flagged shape, such as a mirrored one or one in another unit, is left out of the "
-        "network and of the modes.  It is registered afterwards, with the results of the others "
-        "held fixed.  With 'stop' the run ends before the long stages.  With 'off' all shapes are "
-        "in the network and the modes, each can be the median, shapes are not compared with each "
-        "other, and what cleaning, alignment and registration find are warnings")
+        see="study/quality_control")
     include_flagged: bool = quality(False,
         "include suspect (flagged) shapes in the modes and statistics")
     # fmt: on
@@ -679,7 +704,7 @@ def _entry(one):
     presets = "".join(f", {name} {value!r}" for name, value in meta["presets"].items())
     text = f"{meta['help'][0].upper()}{meta['help'][1:]}"
     text += f" ({meta['section']})." if meta["section"] else "."
-    text += f"  {meta['more']}." if meta["more"] else ""
+    text += f"  {NOTES[one.name]}" if one.name in NOTES else ""
     module = meta["see"].replace("/", ".")
     text += f"  See :mod:`s4a.{module}`." if module else ""
     lines = textwrap.wrap(text, 92, break_on_hyphens=False, break_long_words=False)
@@ -688,6 +713,14 @@ def _entry(one):
     )
 
 
-if Options.__doc__:  # not with python -OO
-    entries = textwrap.indent("\n".join(map(_entry, DECLARED.values())), "    ").lstrip()
-    Options.__doc__ = Options.__doc__.replace("{options}", entries)
+_DOCUMENTED = inspect.getdoc(Options) or ""
+# what the docstring says of an option in addition to its help
+NOTES = {
+    name: " ".join(text.split())
+    for name, text in re.findall(r"^(\w+)\n((?:    .+\n)+)", _DOCUMENTED, re.MULTILINE)
+    if name in DECLARED
+}
+if NOTES:  # not with python -OO
+    before, _, after = _DOCUMENTED.partition("preset\n")
+    entries = "\n".join(map(_entry, DECLARED.values()))
+    Options.__doc__ = before + entries + after[after.index("\n\nRaises") :]
