@@ -6,6 +6,7 @@ Suspect shapes are reported and never changed.
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -377,50 +378,13 @@ _MUCH_MORE = 10.0  # times the share of self-intersections, or the step, of the 
 CLOSE = 2.0  # times the usual residual; a part is not a mirror image
 
 
-# kind: whether it flags the shape, as only the user can decide (an outlier in form is reported
-# only); the message, with what was found and expected; the remedy, with the flags of `s4a run`
-# fmt: off
+# kind -> whether it flags the shape, message with what was found and expected, remedy
 KINDS = {
-    "dropped": (False, "dropped components had {percent:.0f} % of the area; "
-        'components=N or "all" keeps more', "--components all keeps more of them"),
-    "unit": (True, "{ratio:.3g} times the size of the others, near {unit}: are its "
-        "coordinates in another unit? The size was not changed; scale the file if that is wrong",
-        "scale the files to the unit of the others"),
-    "size": (False, "{ratio:.3g} times the size of the others; the size was not changed; scale the "
-        "file if that is wrong", "scale the files if their size is wrong"),
-    "genus": (False, "genus {genus}, but {usual} in {number} of {n} shapes; wrap=True closes "
-        "tunnels", "--wrap closes tunnels"),
-    "intersections": (False, "{number} triangles intersect others, {percent:.1f} % (others "
-        "{usual_percent:.1f} %); wrap=True removes self-intersections",
-        "--wrap removes self-intersections"),
-    "duplicate": (True, "the same surface as {other}{mirrored}; remove one of them, or the shape "
-        "counts twice", "keep one file of each shape"),
-    "mirrored": (True, "fits as a mirror image (median ICP residual {fit:.3f} as it is, "
-        "{fit_mirrored:.3f} reflected): left and right exchanged? It was not changed; reflect= "
-        "mirrors it", "--reflect mirrors them, if left and right are exchanged"),
-    "partial": (True, "its boundary loops have a length of {value:.2g} sqrt(area), those of the "
-        "others {usual:.2g}: is a part missing? Complete or remove the scan; if these are only "
-        "holes, use close_holes=True", "scan again, or remove the files"),
-    "spacing": (False, "coordinates are rounded to {value:.2f} of an edge (others {usual:.2f}); "
-        "export the file with more digits", "export the files with more digits"),
-    "kind": (False, "outlier: {what} {deviations:.0f} robust deviations from the median; is it "
-        "another kind of shape, stretched, or only a part? Remove it if it does not belong "
-        "to the collection", "remove the files if they are of another kind"),
-    "pose": (True, "ambiguous pose: {number} poses fit equally well (residual {best:.3f}, rotated "
-        "by {angle:.0f} degrees {second:.3f} sqrt(area)); give landmarks=, or alignment='given' if "
-        "the files are aligned", "give --landmarks, or --alignment given if the files are aligned"),
-    "registration": (True, "registration {sure} (score {registration_error:.3f}{distortion}): "
-        "inspect it with s4a view, compare its file with the template's, or remove it",
-        "look at the page; a larger --n-coarse may help"),
-    "influential": (False, "dominates mode {component}: it has {percent:.0f} % of the sum of "
-        "squared scores, and the mode {mode_percent:.1f} % of the variance; check size and "
-        "registration of the shape, and compare with the modes without it",
-        "it dominates a mode of variation: check it"),
-    "near-copy": (False, "nearly the same shape as {other}: their distance is {percent:.1f} % of "
-        "the usual distance between neighbours; keep one of them, if they are copies",
-        "keep one file of each shape"),
+    kind: (flags == "flag", message, remedy)
+    for line in Path(__file__).with_name("kinds.txt").read_text(encoding="utf-8").splitlines()
+    if line[0] != "#"
+    for kind, flags, message, remedy in [line.split(" | ")]
 }
-# fmt: on
 # kind: attribute of the comparison, and the least value that is reported
 _MUCH_MORE_OF = {"intersections": ("intersecting", _CROSSING), "spacing": ("lattice", _LATTICE)}
 
