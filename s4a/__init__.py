@@ -22,7 +22,7 @@ new shapes                :func:`insert`
 6.2 transfer              :func:`transfer_labels`, :func:`transfer_landmarks`,
                           :func:`transfer_scalars`, :func:`register_pairs`,
                           :func:`correspondence`
-for other programs        :func:`write_registered`, :func:`write_label_volumes`
+for other programs        :func:`write_registered`
 the bundled collection    :mod:`s4a.synthetic`
 ========================  ====================================================================
 

@@ -16,7 +16,6 @@ from .analysis.transfer import correspondence as correspondence
 from .analysis.transfer import transfer_labels as transfer_labels
 from .analysis.transfer import transfer_landmarks as transfer_landmarks
 from .analysis.transfer import transfer_scalars as transfer_scalars
-from .analysis.volumes import write_label_volumes as write_label_volumes
 from .datasets import synthetic as synthetic
 from .evaluation import metrics as metrics
 from .evaluation.comparison import compare as compare

@@ -13,7 +13,7 @@ parts of shapes        :func:`complete`, :func:`write_completed`
 several structures     :func:`analyse_structures`, :func:`open_structures`,
                        :func:`insert_structures`, :func:`of_structure`, :func:`structures`,
                        :func:`structures_modes`, :func:`structures_of_new`
-other programs         :func:`write_for`, :func:`write_training_set`
+other programs         :func:`write_for`, :func:`write_label_volumes`, :func:`write_training_set`
 =====================  =====================================================================
 
 They are imported when they are first used.

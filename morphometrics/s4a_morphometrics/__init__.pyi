@@ -11,6 +11,7 @@ from .region_panel import Region
 from .restrict import with_size, within, without
 from .several import analyse_structures, insert_structures, of_structure, open_structures
 from .two_block import covariation, covariation_modes
+from .volumes import write_label_volumes
 
 __all__ = [
     "Region",
@@ -41,5 +42,6 @@ __all__ = [
     "write_completed",
     "write_field",
     "write_for",
+    "write_label_volumes",
     "write_training_set",
 ]

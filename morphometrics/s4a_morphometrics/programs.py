@@ -16,7 +16,6 @@ import xarray as xr
 from s4a.analysis.export import map_to_scan, write_dataset
 from s4a.analysis.inputs import registration_of
 from s4a.analysis.transfer import image_in_shape, transfer_labels, transfer_landmarks
-from s4a.analysis.volumes import write_label_volumes
 from s4a.geometry.align import farthest_points
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.input.annotations import write_landmarks, write_rows
@@ -28,6 +27,7 @@ from s4a.method.pca import synthesize
 from s4a.schema import check_count, dataset, in_unit, unit_of, variable
 from s4a.seeds import RNG, seed_of
 from s4a_morphometrics.scalismo import write_scalismo
+from s4a_morphometrics.volumes import write_label_volumes
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ def write_for(study: xr.DataTree, folder: Path | str, program: str, **options: A
     program : {"slicer", "shapeworks", "scalismo", "paraview", "r", "nifti"}
         See :func:`write_slicer`, :func:`write_shapeworks`,
         :func:`s4a_morphometrics.scalismo.write_scalismo`, :func:`write_paraview`, :func:`write_r`
-        and :func:`s4a.analysis.volumes.write_label_volumes`.
+        and :func:`s4a_morphometrics.volumes.write_label_volumes`.
     **options
         Options of that function.
 

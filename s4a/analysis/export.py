@@ -84,7 +84,7 @@ def write_registered(
     See Also
     --------
     s4a.write_mesh : Write one mesh.
-    s4a.write_label_volumes : Write labels as volumes.
+    s4a_morphometrics.write_for : Write the files of other programs, such as label volumes.
 
     Examples
     --------

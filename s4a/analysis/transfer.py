@@ -394,7 +394,7 @@ def transfer_labels(
     --------
     s4a.transfer_scalars : Scalar fields.
     s4a.transfer_landmarks : Landmarks.
-    s4a.write_label_volumes : Labels as volumes.
+    s4a_morphometrics.write_label_volumes : Labels as volumes.
 
     Examples
     --------

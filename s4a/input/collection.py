@@ -254,7 +254,7 @@ def read_labels(paths: Paths, *, label: Label = "all", **options: Any) -> xr.Dat
 
     See Also
     --------
-    write_label_volumes : write a structure of the template into the volumes of the shapes.
+    s4a_morphometrics.write_label_volumes : labels of the template in the volumes of the shapes.
 
     References
     ----------

@@ -71,12 +71,13 @@ def write_label_volumes(
     >>> import nibabel
     >>> import numpy as np
     >>> import s4a
+    >>> import s4a_morphometrics
     >>> study, folder = s4a.synthetic.example_study(), Path(tempfile.mkdtemp())
     >>> affine = np.array([[4, 0, 0, -120], [0, 4, 0, -120], [0, 0, 4, -120], [0, 0, 0, 1.0]])
     >>> scan = nibabel.Nifti1Image(np.zeros((60, 60, 60), np.uint8), affine)
     >>> nibabel.save(scan, folder / "scan.nii")
     >>> label, grid = np.ones(200, int), folder / "scan.nii"
-    >>> paths = s4a.write_label_volumes(study, folder, label=label, grid=grid)
+    >>> paths = s4a_morphometrics.write_label_volumes(study, folder, label=label, grid=grid)
     >>> paths[0].name
     'brain_01.nii.gz'
     """
