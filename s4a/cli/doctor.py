@@ -5,9 +5,7 @@ files that it has written.
 """
 
 import contextlib
-import os
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,8 +16,6 @@ from pathlib import Path
 
 GIB = 2**30
 LEAST_MEMORY = 2.0  # GiB, for ten heads of 150,000 vertices on two cores; the demo takes less
-LEAST_DISK = 1.0  # GiB, for a study
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari")
 GL = "apt-get install libgl1 libopengl0, or what your system calls libGL.so.1 and libOpenGL.so.0"
 # distributions whose modules have other names
 MODULES = {"libigl": "igl", "pillow": "PIL", "scikit-learn": "sklearn"}
@@ -78,10 +74,10 @@ def examine(folder: Path | str = ".") -> list[Finding]:
     found += [*dependencies(), writable("study folder", Path(folder), "another --out")]
     temporary = Path(tempfile.gettempdir())
     found += [writable("temporary folder", temporary, "export TMPDIR=FOLDER")]
-    for check in (cache, memory, cores, threads):
+    for check in (memory, threads):
         with contextlib.suppress(ImportError):  # packages that do not import are reported above
             found.append(check())
-    return [*found, disk(Path(folder)), browser(), *extras()]
+    return [*found, *extras()]
 
 
 def dependencies() -> Iterator[Finding]:
@@ -172,16 +168,6 @@ def writable(what: str, folder: Path, instead: str) -> Finding:
     return Finding(what, "ok", f"{folder.resolve()} can be written and locked")
 
 
-def cache() -> Finding:
-    """Check that matplotlib can write its cache of fonts."""
-    import matplotlib
-
-    folder = matplotlib.get_cachedir()
-    text = f"{folder} cannot be written, so every command that draws searches all fonts"
-    do = "export MPLCONFIGDIR=FOLDER"
-    return noted("cache of fonts", os.access(folder, os.W_OK), folder, text, do)
-
-
 def memory() -> Finding:
     """Return the free memory."""
     from s4a.geometry.compiled import psutil
@@ -192,23 +178,6 @@ def memory() -> Finding:
     text = f"{free:.1f} GiB free"
     few = f"{text}; {LEAST_MEMORY:.0f} is little for large meshes"
     return noted("memory", free >= LEAST_MEMORY, text, few, "--n-jobs 1, or close other programs")
-
-
-def disk(folder: Path) -> Finding:
-    """Return the free space where the study would be written."""
-    there = next(p for p in (folder.resolve(), *folder.resolve().parents) if p.exists())
-    free = shutil.disk_usage(there).free / GIB
-    text = f"{free:.1f} GiB free"
-    return noted(
-        "disk", free >= LEAST_DISK, text, f"{text} in {there}", "give another folder to --out"
-    )
-
-
-def cores() -> Finding:
-    """Return the cores of this process: those of its container or job, not of the machine."""
-    from joblib import cpu_count
-
-    return Finding("cores", "ok", f"{cpu_count()} for this process; --n-jobs uses all by default")
 
 
 def threads() -> Finding:
@@ -224,15 +193,6 @@ def threads() -> Finding:
         for pool in threadpool_info()
     )
     return Finding("threads", "ok", f"{text}; workers of a run use one each")
-
-
-def browser() -> Finding:
-    """Look for a browser for the pages, which are written without one."""
-    here = next((name for name in BROWSERS if shutil.which(name)), "")
-    if not here and sys.platform in ("darwin", "win32"):
-        here = "browser of the system"
-    text = "none found; s4a view still writes pages"
-    return noted("browser", here, here, text, "open them on another machine")
 
 
 def extras() -> Iterator[Finding]:
