@@ -48,6 +48,6 @@ from .study.pair import match_pair as match_pair
 from .study.pair import register_pairs as register_pairs
 from .study.pipeline import analyse as analyse
 from .study.tree import open_study as open_study
-from .study.verify import verify as verify
+from .study.tree import verify as verify
 
 __version__: str

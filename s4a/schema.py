@@ -33,16 +33,20 @@ _UNITS = {
 }  # fmt: skip
 
 
-# rows of the two tables of schema.txt: variables, and files of a study
-_VARIABLES, _FILES = (
-    [[cell.strip() for cell in line.split("|", 3)] for line in part.splitlines() if line[0] != "#"]
-    for part in Path(__file__).with_name("schema.txt").read_text(encoding="utf-8").split("\n\n")
-)
+def _cells(table, n):
+    """Return the rows of a table of ``schema.txt``, each with n cells."""
+    rows = (line.split("|", n - 1) for line in table.splitlines() if line[0] != "#")
+    return [[cell.strip() for cell in row] for row in rows]
+
+
+_VARIABLES, _FILES = Path(__file__).with_name("schema.txt").read_text("utf-8").split("\n\n")
 ROWS: dict[str, tuple[str, str, str]] = {
-    name: (dims, _UNITS.get(unit, unit), meaning) for name, dims, unit, meaning in _VARIABLES
+    name: (dims, _UNITS.get(unit, unit), meaning)
+    for name, dims, unit, meaning in _cells(_VARIABLES, 4)
 }
-# required contents of a file of a study: variables, text attributes, numeric attributes
-HOLDS = {kind: tuple(contents) for kind, *contents in _FILES}
+# required contents of a file of a study: variables, text attributes, numeric attributes, and
+# dims with another file and its dim of the same size; {template} is that of the registration
+HOLDS = {kind: tuple(contents) for kind, *contents in _cells(_FILES, 5)}
 
 
 class Table(dict[str, tuple[tuple[str, ...], str, str]]):

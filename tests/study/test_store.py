@@ -125,7 +125,7 @@ def test_what_is_not_a_study_is_refused(tmp_path):
 
 def zeros(kind, sizes, attrs=None, **own):
     """A Dataset of all variables that a file of this kind needs."""
-    needed, texts, numbers = (words.split() for words in HOLDS[kind])
+    needed, texts, numbers, _ = (words.split() for words in HOLDS[kind])
     values = {}
     for name in needed:
         if name not in ("shape", "stage"):

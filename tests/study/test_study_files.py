@@ -14,8 +14,7 @@ from small import OPTIONS
 from s4a import analyse, cli, open_study, synthetic, verify
 from s4a.study import netcdf, store
 from s4a.study.progress import read_costs
-from s4a.study.tree import Reader
-from s4a.study.verify import check_file
+from s4a.study.tree import Reader, check_file
 
 SECRET = b"the diary of somebody else " * 40
 
