@@ -631,7 +631,7 @@ DECLARED: dict[str, Field[Any]] = {one.name: one for one in fields(Options)}
 PRESETS: dict[str | None, dict[str, Any]] = {
     None: {
         name: one.metadata["default"] for name, one in DECLARED.items() if one.metadata["presets"]
-    },
+    }
 } | {
     preset: {
         name: one.metadata["presets"][preset]

@@ -16,13 +16,7 @@ from s4a.analysis.inputs import (
     sample_of,
 )
 from s4a.analysis.model import count_components
-from s4a.analysis.permutation import (
-    Model,
-    check_options,
-    indicators,
-    scatter_test,
-    standardize,
-)
+from s4a.analysis.permutation import Model, check_options, indicators, scatter_test, standardize
 from s4a.geometry.mesh import as_arrays, vertex_normals
 from s4a.method.deform import normal_displacement
 from s4a.method.pca import gram, principal_components

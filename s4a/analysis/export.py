@@ -12,14 +12,7 @@ from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_rows
 from s4a.input.chirality import map_to_file
-from s4a.input.coordinates import (
-    UNKNOWN,
-    CoordinateSystem,
-    file_system,
-    map_between,
-    moved,
-    turned,
-)
+from s4a.input.coordinates import UNKNOWN, CoordinateSystem, file_system, map_between, moved, turned
 from s4a.input.files import write_mesh
 from s4a.input.raw import new_folder
 from s4a.schema import Array, check_choice

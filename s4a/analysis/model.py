@@ -210,12 +210,7 @@ def variance_baseline(features: Array, n_permutations: int, rng: np.random.Gener
 
 
 def count_components(
-    variance: Array,
-    s: int,
-    n_components: int | None,
-    *,
-    most: int,
-    at_most: int | None = None,
+    variance: Array, s: int, n_components: int | None, *, most: int, at_most: int | None = None
 ) -> int:
     """Return the number of components of a test of s shapes; ValueError if it exceeds `most`.
 

@@ -95,9 +95,7 @@ def voxels_marked(path: str | os.PathLike[str], label: Label) -> tuple[Array, Ar
     return _marked(values, check_label(label)), affine
 
 
-def read_grid(
-    path: str | os.PathLike[str],
-) -> tuple[tuple[int, ...], Array, CoordinateSystem]:
+def read_grid(path: str | os.PathLike[str]) -> tuple[tuple[int, ...], Array, CoordinateSystem]:
     """Read the shape of a volume, of labels or grey values, its affine map, and its system.
 
     Raises

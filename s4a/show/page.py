@@ -82,11 +82,7 @@ def write_page(
 
 
 def study_html(
-    study: xr.DataTree,
-    *,
-    title: str = "Shape study",
-    view: Viewpoint = "corner",
-    up: str = "z",
+    study: xr.DataTree, *, title: str = "Shape study", view: Viewpoint = "corner", up: str = "z"
 ) -> str:
     """Return the HTML page of a study; see :func:`write_page`."""
     check_type(study, xr.DataTree)

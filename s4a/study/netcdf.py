@@ -266,11 +266,7 @@ def stacked(variables: list[xr.Variable]) -> Any:
 
 
 def open_file(
-    path: Path | str,
-    others: Mapping[str, int] | None = None,
-    *,
-    node: str = "",
-    load: bool = False,
+    path: Path | str, others: Mapping[str, int] | None = None, *, node: str = "", load: bool = False
 ) -> xr.Dataset:
     """Open a file, or a group of it, as a Dataset; larger variables are read when they are used.
 

@@ -332,10 +332,7 @@ def check_pair(score: float, distortion: float, n: int, options: Options) -> dic
     found, _ = flagged({"pair": score}, {"pair": distortion}, {"pair": n}, usual=0.0)
     found = unflagged(found) if options.quality_control == "off" else found
     is_flagged = any(one.flagged for one in found.get("pair", []))
-    return {
-        "status": "flagged" if is_flagged else "ok",
-        "warning": in_words(found.get("pair", [])),
-    }
+    return {"status": "flagged" if is_flagged else "ok", "warning": in_words(found.get("pair", []))}
 
 
 def flagged(

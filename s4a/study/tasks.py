@@ -22,13 +22,7 @@ from s4a.input.collection import read_shape
 from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.landmarks import guides_of, with_landmarks
 from s4a.method import steps
-from s4a.method.alignment import (
-    Voters,
-    align_voted,
-    alignment_residual,
-    less_confident,
-    voters_of,
-)
+from s4a.method.alignment import Voters, align_voted, alignment_residual, less_confident, voters_of
 from s4a.method.latent import out_of_sample_latent
 from s4a.method.network import spectral_distance
 from s4a.method.refined_eigenfunctions import low_resolution

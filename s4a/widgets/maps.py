@@ -15,14 +15,8 @@ from s4a.show.surfaces import has
 from s4a.widgets.panel import WIDE, Panel, dropdown, row
 
 # variable -> its name; of vectors the normal component is shown
-SIGNED_MAPS = {
-    "effect": "effect, along the normals",
-    "field_effect": "effect on the field",
-}
-POSITIVE_MAPS = {
-    "effect_size": "effect size",
-    "explained_share": "explained share of the variance",
-}
+SIGNED_MAPS = {"effect": "effect, along the normals", "field_effect": "effect on the field"}
+POSITIVE_MAPS = {"effect_size": "effect size", "explained_share": "explained share of the variance"}
 EVERYWHERE = "everywhere"
 P_VALUES = {
     "p_family_wise": "family-wise",

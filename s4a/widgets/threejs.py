@@ -138,9 +138,7 @@ def _field_colors(mesh, field, cmap, limits):
 
 
 def field_colors(
-    values: Array,
-    cmap: str | Colormap | None = None,
-    limits: tuple[float, float] | None = None,
+    values: Array, cmap: str | Colormap | None = None, limits: tuple[float, float] | None = None
 ) -> Array:
     """Return colours ``(n, 3)`` of numbers ``(n,)``; see :func:`surface`.
 
@@ -218,11 +216,7 @@ class ModesMesh(three.Mesh):
 
 
 def modes(
-    study: xr.DataTree,
-    *,
-    n_modes: int | None = 10,
-    resolution: str = "full",
-    colored: bool = True,
+    study: xr.DataTree, *, n_modes: int | None = 10, resolution: str = "full", colored: bool = True
 ) -> ModesMesh:
     """Return the mean shape of a study, deformed in the browser by its scores (6.1).
 
@@ -467,11 +461,7 @@ def correspondence(
     return three.Group(
         # around the origin, where pythreejs looks initially, whatever the target of its controls
         position=(-(points.max(0) + points.min(0)) / 2).tolist(),
-        children=[
-            _body(X, S, colors),
-            _body(Y, T, colors[match]),
-            segments,
-        ],
+        children=[_body(X, S, colors), _body(Y, T, colors[match]), segments],
     )
 
 

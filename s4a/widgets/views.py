@@ -11,15 +11,7 @@ import numpy as np
 import traitlets
 
 from s4a.schema import Array
-from s4a.show.browser import (
-    CHART,
-    SCENE,
-    STYLE,
-    color_bytes,
-    color_scale,
-    palette,
-    to_bytes,
-)
+from s4a.show.browser import CHART, SCENE, STYLE, color_bytes, color_scale, palette, to_bytes
 from s4a.show.charts import reach
 from s4a.show.draw import (
     SIGNED,
@@ -165,11 +157,7 @@ class Scene(View):
         self.observe(self.draw_still, ["webgl", "points"])
 
     def show(
-        self,
-        points: Array,
-        triangles: Array,
-        colors: Array | None = None,
-        title: str | None = None,
+        self, points: Array, triangles: Array, colors: Array | None = None, title: str | None = None
     ) -> None:
         """Show a surface ``(n, 3)``, ``(m, 3)`` with colours ``(n, 3)``, and remove all marks."""
         self.surface = np.asarray(points), np.asarray(triangles)
