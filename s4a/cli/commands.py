@@ -299,7 +299,7 @@ def write_statistics(
     options: dict[str, Any],
 ) -> None:
     """Evaluate and test a study, write the results to a folder, and print them."""
-    results = tests_of(tree, group, variable, permutations, options)  # first: these may be refused
+    results = _tests_of(tree, group, variable, permutations, options)  # first: these may be refused
     results["evaluation"] = s4a.statistics.evaluate(tree, seed=options["seed"])
     results["outliers"] = s4a.statistics.outliers(tree)
     for name, result in results.items():
@@ -343,13 +343,7 @@ def labels_in(file: str, mesh: "xr.Dataset") -> "np.ndarray":
     return s4a.input.annotations.labels_of_mesh(label, mesh)
 
 
-def tests_of(
-    study: "xr.DataTree",
-    group: str | None,
-    variable: str | None,
-    permutations: int | None,
-    options: dict[str, Any],
-) -> "dict[str, xr.Dataset]":
+def _tests_of(study, group, variable, permutations, options):
     """Return the results of the tests of the group and of the variable."""
     of_classes = {"seed": options["seed"]}
     if permutations is not None:
@@ -469,7 +463,7 @@ def transfer(
         carried["labels"] = s4a.transfer_labels(study, label, blur=blur, **given)
     if points is not None:
         carried["landmarks"] = s4a.transfer_landmarks(study, points, **given)
-    rows = transferred_rows(study, carried, folder)
+    rows = _transferred_rows(study, carried, folder)
     registered = {n: node.attrs for n, node in study["registration"].children.items()}
     warned = {n: attrs for n, attrs in registered.items() if attrs.get("warning")}
     lines = (f"{n} {attrs['status']}: {attrs['warning']}" for n, attrs in warned.items())
@@ -493,9 +487,7 @@ def registered_pairs(
     return s4a.register_pairs(source, meshes, name=name, n_jobs=n_jobs, **options), excluded
 
 
-def transferred_rows(
-    study: "xr.DataTree", carried: "dict[str, xr.DataTree]", out: Path
-) -> list[list[Any]]:
+def _transferred_rows(study, carried, out):
     """Write the files of every target, and return the rows of the table that is printed."""
     first, *_ = carried.values()
     meshes = {name: study["original"][name].to_dataset() for name in first.children}
@@ -509,7 +501,7 @@ def transferred_rows(
         cells = tables.registration_cells(study["registration"].to_dataset().sel(shape=name))[1:]
         of_labels, of_points = ["-"] * 3, ["-"] * 2
         if "labels" in carried:
-            of_labels = write_labels(carried["labels"][name].to_dataset(), mesh, out, stem)
+            of_labels = _write_labels(carried["labels"][name].to_dataset(), mesh, out, stem)
         if "landmarks" in carried:
             landmarks = carried["landmarks"][name].to_dataset()
             place = landmarks["landmark_position"]
@@ -521,9 +513,9 @@ def transferred_rows(
     return rows
 
 
-def write_labels(labels: "xr.Dataset", mesh: "xr.Dataset", out: Path, stem: str) -> list[str]:
+def _write_labels(labels, mesh, out, stem):
     """Write labels and confidence as NPY, a row for each vertex of the file; return the cells."""
-    points = file_points(mesh)
+    points = _file_points(mesh)
     for name in ("label", "confidence"):
         values, dropped = s4a.input.annotations.labels_of_file(labels[name].values, mesh, points)
         np.save(out / f"{stem}.{'labels' if name == 'label' else name}.npy", values)
@@ -531,7 +523,7 @@ def write_labels(labels: "xr.Dataset", mesh: "xr.Dataset", out: Path, stem: str)
     return [*means, str(dropped)]
 
 
-def file_points(mesh: "xr.Dataset") -> "np.ndarray":
+def _file_points(mesh):
     """Return the vertices of a mesh file (n, 3); NaN for dropped ones if the file is gone."""
     path, label = mesh.attrs.get("path") or "", mesh.attrs.get("label")
     if Path(path).is_file():
@@ -594,7 +586,7 @@ def compare(
         seconds = found["collection_seconds"].values.reshape(len(names), -1)
         text = tables.collection_table(found)
     else:
-        result = compare_pairs(paths or [], truth, landmarks, options | {"methods": methods}, keep)
+        result = _compare_pairs(paths or [], truth, landmarks, options | {"methods": methods}, keep)
         found = result["metrics"].to_dataset() if keep else result
         names = found["algorithm"].values.tolist()
         seconds = found["block_seconds"].mean("pair").values
@@ -613,13 +605,7 @@ def compare(
     return 0
 
 
-def compare_pairs(
-    paths: list[str],
-    truth: list[str] | None,
-    landmarks: list[str] | None,
-    options: dict[str, Any],
-    keep: bool,
-) -> Any:
+def _compare_pairs(paths, truth, landmarks, options, keep):
     """Return Table 1 of pairs, as a Dataset, or with `keep` as a DataTree."""
     if len(paths) < 2:
         raise ValueError("compare needs SOURCE and TARGET, or --collection PATH...")
@@ -638,15 +624,13 @@ def compare_pairs(
         source,
         dict(zip(names, files, strict=True)),
         truth=dict(zip(names, known, strict=True)) if truth else None,
-        landmarks=landmark_pairs(landmarks, names),
+        landmarks=_landmark_pairs(landmarks, names),
         keep=keep,
         **options,
     )
 
 
-def landmark_pairs(
-    files: list[str] | None, targets: list[str]
-) -> "dict[str, list[xr.Dataset]] | None":
+def _landmark_pairs(files, targets):
     """Return the landmarks that the source and each target have in common."""
     if not files:
         return None

@@ -95,7 +95,7 @@ def command(
         for parameter in own:
             if parameter.name != "words":
                 value, about = documented.get(parameter.name, ("", ""))
-                add_parameter(add, parameter, value or None, " ".join(about.split()) or None)
+                _add_parameter(add, parameter, value or None, " ".join(about.split()) or None)
         add_options(add, options, unset=unset)
 
     run.__doc__ = summary
@@ -115,9 +115,7 @@ def with_default(text: str | None, default: Any) -> str | None:
     return f"{text.removesuffix('.')} (default: {shown})"
 
 
-def add_parameter(
-    add: Callable[..., Any], parameter: inspect.Parameter, metavar: str | None, text: str | None
-) -> None:
+def _add_parameter(add, parameter, metavar, text):
     """Add the flag, or the positional argument, of one parameter of a function."""
     is_set = parameter.default is not parameter.empty
     if parameter.annotation is bool:

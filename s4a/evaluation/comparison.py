@@ -6,7 +6,7 @@ All methods use the same cleaned meshes.  :mod:`s4a.evaluation.methods` implemen
 import io
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,7 +68,7 @@ def check_some(methods: Sequence[str], known: Sequence[str]) -> None:
         raise ValueError(f"methods must be some of {', '.join(known)}; found {wrong or methods!r}")
 
 
-def checked_methods(methods: Sequence[str] | None, preset: str | None) -> Sequence[str]:
+def _checked_methods(methods, preset):
     """Return the methods, by default all, or those of the paper with its preset."""
     if methods is None:
         return PAPER_METHODS if preset == "paper" else METHODS
@@ -89,7 +89,7 @@ def load_mesh(shape: Mesh, what: str) -> tuple[xr.Dataset, float]:
     return mesh, 0.0 if mesh is shape else time.process_time() - begin
 
 
-def in_mesh(vertices: Array, mesh: xr.Dataset) -> Array:
+def _in_mesh(vertices, mesh):
     """Convert rows of a file to vertices of its clean mesh ``(n,)``.
 
     Rows that are -1, or were dropped by cleaning, become -1.
@@ -100,7 +100,7 @@ def in_mesh(vertices: Array, mesh: xr.Dataset) -> Array:
     return np.where(vertices >= 0, became[np.maximum(vertices, 0)], -1)
 
 
-def ground_truth_in_meshes(truth: Array, source: xr.Dataset, target: xr.Dataset) -> Array:
+def _ground_truth_in_meshes(truth, source, target):
     """Convert ground truth for the rows of files to ground truth for clean meshes.
 
     Parameters
@@ -115,7 +115,7 @@ def ground_truth_in_meshes(truth: Array, source: xr.Dataset, target: xr.Dataset)
     if truth.ndim == 1 and truth.dtype.kind not in "iu":
         raise ValueError(f"truth needs integers, rows of the source's file; found {truth.dtype}")
     truth = truth[target["file_vertex"].values]
-    return truth if truth.ndim == 2 else in_mesh(truth, source)
+    return truth if truth.ndim == 2 else _in_mesh(truth, source)
 
 
 def read_ground_truth(path: Path | str) -> Array:
@@ -214,7 +214,7 @@ def compare(
         to each method that uses them.  The attribute ``note`` names pairs with a reduced k.
 
         With `keep`, the metrics are the node ``/metrics`` of a tree; ``/source`` is the mesh of the
-        source, and ``/pairs/<pair>`` that of a target with the results of :func:`with_results`.
+        source, and ``/pairs/<pair>`` that of a target with the results of every method.
 
     Raises
     ------
@@ -245,7 +245,7 @@ def compare(
     check_count("full_resolution_iterations", settings["full_resolution_iterations"])
     check_choice("init", settings["init"], INITS)
     check_switch("keep", keep)
-    methods = checked_methods(methods, preset)
+    methods = _checked_methods(methods, preset)
     in_memory = isinstance(source, xr.Dataset)
     if any(isinstance(mesh, xr.Dataset) != in_memory for mesh in target.values()):
         raise ValueError("source and targets need to be all paths or all Datasets")
@@ -263,7 +263,7 @@ def compare(
             marks = None if landmarks is None else landmarks_of(landmarks[name], M, N, in_memory)
             true = None if truth is None else truth[name]
             if true is not None and not in_memory:
-                true = ground_truth_in_meshes(true, M.mesh, N.mesh)
+                true = _ground_truth_in_meshes(true, M.mesh, N.mesh)
             pair = Pair(M, N, marks, **options)
             row, outcomes = metrics_of_pair(
                 pair, methods, load_source + load_target, true, n_geodesic
@@ -271,10 +271,10 @@ def compare(
             rows.append(row)
             notes[name] = row.attrs.pop("note", "")
             if keep:
-                nodes[f"pairs/{name}"] = with_results(M.mesh, N.mesh, outcomes, true)
+                nodes[f"pairs/{name}"] = _with_results(M.mesh, N.mesh, outcomes, true)
     table = xr.concat(rows, "pair", combine_attrs="drop_conflicts")
     table = table.assign_coords(pair=list(target)).transpose("algorithm", "pair", ...)
-    table = table.assign_attrs(options | {"n_coarse": n_coarse, "seed": seed} | joint_note(notes))
+    table = table.assign_attrs(options | {"n_coarse": n_coarse, "seed": seed} | _joint_note(notes))
     if not keep:
         return table
     return xr.DataTree.from_dict(
@@ -282,13 +282,13 @@ def compare(
     )
 
 
-def note_on_k(k: int, least: int) -> dict[str, str]:
+def _note_on_k(k, least):
     """Return a note as an attribute if meshes have fewer eigenfunctions than k."""
     note = f"k = {k} reduced to {least}, the number of eigenfunctions of the smaller mesh"
     return {"note": note} if least < k else {}
 
 
-def joint_note(notes: Mapping[str, str]) -> dict[str, str]:
+def _joint_note(notes):
     """Log the notes of all pairs and return them as one attribute, if there are any."""
     note = "; ".join(f"{name}: {text}" for name, text in notes.items() if text)
     if not note:
@@ -297,9 +297,7 @@ def joint_note(notes: Mapping[str, str]) -> dict[str, str]:
     return {"note": note}
 
 
-def with_results(
-    source: xr.Dataset, target: xr.Dataset, outcomes: dict[str, Outcome], truth: ArrayLike | None
-) -> xr.Dataset:
+def _with_results(source, target, outcomes, truth):
     """Return the target's mesh with the results of every method.
 
     Returns
@@ -369,7 +367,7 @@ def landmarks_of(given: Any, source: Spaces, target: Spaces, clean: bool) -> Mat
         if v.ndim == 2 and v.shape[1] == 3:
             v = cKDTree(space.mesh["position"].values).query(v)[1]
         elif not clean and v.dtype.kind in "iu":
-            v = in_mesh(v, space.mesh)
+            v = _in_mesh(v, space.mesh)
         ends.append(v)
         good = v.ndim == 1 and v.dtype.kind in "iu" and len(v) >= 3
         if not (good and 0 <= v.min() <= v.max() < len(space.X) and len(v) == len(ends[0])):
@@ -397,7 +395,7 @@ def metrics_of_pair(
     table = xr.concat(rows, "algorithm", combine_attrs="drop_conflicts")
     table["block_seconds"] = variable("block_seconds", np.array(seconds)[:, None]).isel(pair=0)
     least = min((len(r.fmap) for r in pair.spectral.values()), default=pair.k)
-    table.attrs |= note_on_k(pair.k, least)
+    table.attrs |= _note_on_k(pair.k, least)
     return table.assign_coords(algorithm=list(methods), block=list(BLOCKS)), outcomes
 
 
@@ -483,10 +481,10 @@ def compare_collection(
         raise ValueError(f"a collection needs at least 2 shapes, found {len(meshes)}")
     with threadpool_limits(1):
         bar = tqdm(methods, desc="collection")
-        rows = [run_collection(meshes, method, load, options) for method in bar]
+        rows = [_run_collection(meshes, method, load, options) for method in bar]
     notes = {m: row.attrs.pop("note", "") for m, row in zip(methods, rows, strict=True)}
     table = xr.concat(rows, "algorithm").assign_coords(algorithm=list(methods))
-    return table.assign_attrs(joint_note(notes))
+    return table.assign_attrs(_joint_note(notes))
 
 
 class LatentCollection(NamedTuple):
@@ -512,9 +510,7 @@ class LatentCollection(NamedTuple):
         return match_functions(self.shapes[source], self.shapes[target], *functions)[0]
 
 
-def run_collection(
-    meshes: dict[str, xr.Dataset], method: str, load: float, options: Options
-) -> xr.Dataset:
+def _run_collection(meshes, method, load, options):
     """Compute one row of Table 2."""
     found, names = latent_collection(meshes, method, load, options), list(meshes)
     chamfer, full = zip(*(chamfer_to_template(found, how) for how in DENSE_MATCHES), strict=True)
@@ -526,7 +522,7 @@ def run_collection(
     table = xr.Dataset(
         {name: variable(name, values[None]).isel(algorithm=0) for name, values in measures.items()}
         | {"distance_to_limit": found.distance_to_limit},
-        attrs=note_on_k(options.k, found.Y.shape[1]),
+        attrs=_note_on_k(options.k, found.Y.shape[1]),
     )
     return table.assign_coords(
         dense_match=list(DENSE_MATCHES), block=list(COLLECTION_BLOCKS), shape=names

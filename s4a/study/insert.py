@@ -18,7 +18,7 @@ from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.files import SUFFIXES as MESHES
 from s4a.input.files import files_named, suffix_of
 from s4a.input.landmarks import SUFFIXES
-from s4a.input.plausibility import Flag, Flags, find_warnings
+from s4a.input.plausibility import Flag, find_warnings
 from s4a.input.subjects import listed
 from s4a.method.alignment import N_VOTERS, align_onto, less_confident
 from s4a.method.latent import out_of_sample_latent
@@ -156,15 +156,15 @@ def insert(
     if template in meshes:
         raise ValueError(f"new shapes need other names than the template, {template!r}; rename it")
     descriptors = descriptors_of(study) if compare or reflect == AUTO else {}
-    mirrored, remarks = reflected_of_new(reflect, meshes, list(attrs), descriptors)
+    mirrored, remarks = _reflected_of_new(reflect, meshes, list(attrs), descriptors)
     for name in mirrored:
         meshes[name] = mirror_image(meshes[name])
         attrs[name] = attrs[name] | meshes[name].attrs
-    frozen = freeze(study, options)
+    frozen = _freeze(study, options)
     references = descriptors if compare else None
     # in a tuple: dask keeps a bare Dataset on one worker, and loses it with that worker
     results = workers(n_jobs)(
-        delayed(insert_one)((mesh,), frozen, options, references) for mesh in meshes.values()
+        delayed(_insert_one)((mesh,), frozen, options, references) for mesh in meshes.values()
     )
     inserted = {}
     for name, result in zip(meshes, results, strict=True):
@@ -198,7 +198,7 @@ def insert(
         nodes["report"] = shape_report(attrs, flags)
     else:
         compared = {name: r.comparison for name, r in inserted.items() if r.comparison is not None}
-        nodes["report"] = report_on_new(study, attrs, compared, references, flags)
+        nodes["report"] = _report_on_new(study, attrs, compared, references, flags)
     report = nodes["report"].attrs
     report["remarks"] = "\n".join(filter(None, [*remarks, report["remarks"]]))
     # flagged shapes are in the result too
@@ -208,12 +208,7 @@ def insert(
     return xr.DataTree.from_dict(nodes)
 
 
-def reflected_of_new(
-    reflect: str | list[str] | None,
-    meshes: dict[str, xr.Dataset],
-    given: list[str],
-    descriptors: dict[str, xr.Dataset],
-) -> tuple[list[str], list[str]]:
+def _reflected_of_new(reflect, meshes, given, descriptors):
     """Choose the new shapes to mirror; return their names, and remarks.
 
     Parameters
@@ -268,7 +263,7 @@ def read_new(
     landmarks: Path | str | None = None,
 ) -> tuple[dict[str, xr.Dataset], dict[str, dict[str, Any]]]:
     """Read the usable new meshes, with landmarks and fields, and attributes for the report."""
-    volumes = options.label is not None and (isinstance(shapes, dict) or not are_meshes(shapes))
+    volumes = options.label is not None and (isinstance(shapes, dict) or not _are_meshes(shapes))
     sources = find_sources(shapes, volumes=volumes)
     cleaning = options.of("cleaning")
     if options.label is not None and not volumes:  # meshes for a study of label volumes
@@ -287,13 +282,13 @@ def read_new(
     return meshes, attrs
 
 
-def are_meshes(paths: Path | str | list[Any]) -> bool:
+def _are_meshes(paths):
     """Return whether all paths are files with the suffix of a mesh format."""
     files = [paths] if isinstance(paths, str | Path) else paths
     return all(Path(file).is_file() and suffix_of(file) in MESHES for file in files)
 
 
-def freeze(study: xr.DataTree, options: Options) -> Frozen:
+def _freeze(study, options):
     """Collect template and network of a study, without failed and excluded shapes."""
     latent = study["latent"].to_dataset()
     require(latent, "latent_basis", "latent_eigenvalue", what="latent dataset")
@@ -311,21 +306,16 @@ def freeze(study: xr.DataTree, options: Options) -> Frozen:
     return Frozen(shape, Study(xr.DataTree.from_dict(nodes)), names)
 
 
-def insert_one(
-    meshes: tuple[xr.Dataset],
-    frozen: Frozen,
-    options: Options,
-    references: dict[str, xr.Dataset] | None,
-) -> Inserted | ValueError:
+def _insert_one(meshes, frozen, options, references):
     """Insert one new shape; a ValueError is returned, as it concerns this shape only."""
     try:
         with threadpool_limits(1):
-            return _insert_one(*meshes, frozen, options, references)
+            return _inserted(meshes[0], frozen, options, references)
     except ValueError as error:
         return error
 
 
-def _insert_one(mesh, frozen, options, references):
+def _inserted(mesh, frozen, options, references):
     template, study, names = frozen
     (of_template,) = latent_bases(study, names[0])
     k = len(of_template)
@@ -362,7 +352,7 @@ def _insert_one(mesh, frozen, options, references):
     return Inserted(coarse, Y, registration, comparison, aligned.ambiguity)
 
 
-def attributes_of(study: xr.DataTree) -> dict[str, dict[Any, Any]]:
+def _attributes_of(study):
     """Return the attributes of the shapes of a study that are not excluded."""
     excluded = left_out(study)
     names = study["registration"].dataset["shape"].values.tolist()
@@ -372,7 +362,7 @@ def attributes_of(study: xr.DataTree) -> dict[str, dict[Any, Any]]:
 def descriptors_of(study: xr.DataTree) -> dict[str, xr.Dataset]:
     """Return the descriptors of the references of a study."""
     descriptors = {}
-    attrs = attributes_of(study)
+    attrs = _attributes_of(study)
     by_size = sorted(attrs, key=lambda name: attrs[name]["area"])
     for name in plausibility.evenly_chosen(by_size, 2 * plausibility.N_REFERENCES):
         mesh = study["original"][name].to_dataset()
@@ -385,15 +375,9 @@ def descriptors_of(study: xr.DataTree) -> dict[str, xr.Dataset]:
     return {name: descriptors[name] for name in plausibility.pick_references(descriptors)}
 
 
-def report_on_new(
-    study: xr.DataTree,
-    attrs: dict[str, Any],
-    comparisons: dict[str, xr.Dataset],
-    references: dict[str, xr.Dataset],
-    on_poses: Flags,
-) -> xr.Dataset:
+def _report_on_new(study, attrs, comparisons, references, on_poses):
     """Make the report on the new shapes, each compared with those of the study."""
-    in_study = attributes_of(study)
+    in_study = _attributes_of(study)
     compared = {name: plausibility.compare(name, d, references) for name, d in references.items()}
     reported_before = find_warnings(in_study, compared)[1]
     reports, remarks = [], {}
