@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-from s4a.options import DECLARED, NOTES, PRESETS
+from s4a.options import DECLARED, HELP, NOTES, PRESETS
 
 PAPER = PRESETS["paper"]
 DEFAULTS = {name: PRESETS[None][name] for name in PAPER}
@@ -439,7 +439,7 @@ def additions():
 def line_of(name):
     """Return the row of the table for an option that the preset of the paper sets."""
     declared = DECLARED[name].metadata
-    text = ". ".join([declared["help"], *filter(None, [NOTES.get(name, "").removesuffix(".")])])
+    text = ". ".join(filter(None, [HELP[name], NOTES[name].removesuffix(".")]))
     text = re.sub(r"``|:\w+:(?=`)", lambda mark: "`" if mark[0] == "``" else "", text)
     text = text[0].upper() + text[1:].replace(".  ", ". ")
     where = f"`{declared['see']}`"

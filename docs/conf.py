@@ -27,7 +27,7 @@ from slides import WITHOUT_KERNEL
 import paper
 import s4a
 from s4a import cli
-from s4a.options import DECLARED
+from s4a.options import DECLARED, HELP, NOTES
 from s4a.schema import TABLE
 
 HERE = Path(__file__).parent
@@ -165,7 +165,7 @@ def list_options():
         kinds = [getattr(kind, "__name__", "list of str") for kind in kinds if kind is not NoneType]
         values = [f"`{value}`" for value in known["choices"]] or kinds
         presets = "".join(f"; {preset}: `{value}`" for preset, value in known["presets"].items())
-        text = f"{known['help']}. {known['more']}".strip().replace("|", "\\|").replace("``", "`")
+        text = f"{HELP[name]}. {NOTES[name]}".strip().replace("|", "\\|").replace("``", "`")
         text = re.sub(r":\w+:`", "`", f"{text[0].upper()}{text[1:]}").replace("*", r"\*")
         lines.append(
             f"| `{name}` | `{known['default']}`{presets} | {' or '.join(values)} | {text} |"

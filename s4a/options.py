@@ -37,7 +37,6 @@ WITHOUT_MESH = {
 
 def option(
     default: Any,
-    help: str,
     *,
     group: str,
     choices: tuple[str, ...] = (),
@@ -54,13 +53,12 @@ def option(
 ) -> Any:
     """Declare an option as a dataclass field with metadata.
 
+    Its help, the first sentence, and further ones are in the docstring of :class:`Options`.
+
     Parameters
     ----------
     default : object
         Default value, unless a preset sets another.
-    help : str
-        Short description, for the flag and as first sentence of the docstring.  Further sentences
-        are in the docstring of :class:`Options`.
     group : str
         Group under which the command line shows it.
     choices : tuple of str
@@ -228,100 +226,174 @@ class Options:
     Parameters
     ----------
     preset
+        'paper' switches off all additions to the published method; 'fast' halves the time.
         The default, None, uses all additions.  Errors of 'fast' are about a tenth larger
         (``benchmarks/cheaper.py``).  A value that contradicts the preset is refused.  To change one
         entry, pass ``Options(**PRESETS['paper'] | {'refine': 'elastic'})``.
     seed
+        Seed of all random numbers.
         ``rng``, an integer or a ``numpy.random.Generator``, can replace it.
+    pattern
+        Read only files whose name matches a pattern, such as '*brain*'.
+    components
+        Connected components to keep of each mesh: 'largest', 'all' or a number.
+    strict
+        Exclude shapes with non-finite vertices instead of repairing them.
+    close_holes
+        Close each hole with a fan of triangles.
     label
+        Extract the surface of this label, or of the union of several (1,2), from label volumes
+        (NIfTI, MGH, NRRD).
         ``"all"`` means every label but 0, see :func:`s4a.read_labels` for the formats.  By default
         the files are meshes.
     coordinate_system
+        Coordinate system of files that state none: RAS, LPS or 'surface RAS, c_ras X Y Z'.
         Files of different systems are converted to the most frequent one if all are known, and
         refused otherwise (:mod:`s4a.input.coordinates`).  What a file states is never overridden.
+    unit
+        Unit of files that state none: um, mm, cm, m or in.
     reflect
+        Shapes to mirror: names separated by commas, COLUMN=VALUE of the table, or 'auto'.
         Mirroring maps x to -x in the coordinates of the file and reverses the triangles, so that
         left and right shapes get the same chirality.  A column of yes and no needs no value.
         ``auto`` mirrors the shapes of the rarer chirality, found by pairwise ICP of the shapes and
         of their mirror images (:func:`s4a.input.chirality.mirrored_shapes`).  ``/report`` says for
         each shape whether it was mirrored.
     table
+        CSV file with a column 'shape', covariates and groups for the statistics.
         The columns are stored in ``/subjects``; :func:`s4a.input.subjects.read_table` describes the
         format.  Only ``reflect`` and the statistics use the table.  Without a table, the table of
         an earlier run is kept.
     landmarks
+        Folder of landmark files, named as the shapes, that guide alignment and elastic
+        registration.
         The formats are those of :func:`s4a.input.annotations.read_landmarks`.  Shapes without a
         file have no landmarks.  Landmarks of two shapes are paired by name.
         :func:`s4a.with_landmarks` adds landmarks to a mesh in memory.
     features
+        Names of scalar fields that guide registration, separated by commas; the field sulc of a.ply
+        is read from a.sulc.npy.
         A file a.sulc or a property of the PLY file are read, too
         (:func:`s4a.input.annotations.feature_files`).  :func:`s4a.with_features` adds fields to a
         mesh in memory.
     method
+        Low-resolution shapes: remeshed surfaces (rematch) or local functions (scalable).
         The methods are ReMatching and SCALABLE.  Both give the same nodes and variables, but
         SCALABLE has no U.  Its coarse vertices are samples, joined by an edge where their cells
         meet.  ``refined_eigenfunctions`` and ``wrap`` cannot be used with SCALABLE.
     n_coarse
+        Number of vertices of the low-resolution meshes.
         The meshes have between 95 and 110 % of this number, usually 95 %: 5,700 of 6,000, since the
         rest is for repairs of the topology.  With SCALABLE it is the number of samples.
     sampling
+        Samples of the low-resolution meshes: farthest points in position and normal (normals), or,
+        as in ReMatching, along the surface, with U from closest points in space (geodesic).
         Geodesic samples ignore curvature, and U can then cross thin walls.
+    wrap
+        Wrap the shapes in a watertight surface before remeshing.
     refined_eigenfunctions
+        Use refined full-resolution eigenfunctions instead of U Phi.
         U Phi interpolates the eigenfunctions of the coarse mesh.  The refined ones approximate
         those of the original mesh by one step of inverse iteration.  They are used in eq. 4, in eq.
         7 and in the smoothing of eq. 8.  ``/coarse`` stores them, 40 MB for 100,000 vertices.
+    k_init
+        Size of the initial functional maps.
+    k
+        Size of the refined functional maps.
     n_pairs
+        Number of pairs in the network, each with maps in both directions.
         All pairs are used if there are fewer.
     alignment
+        Rigid alignment: the best of several results of ICP in position and normal (search), plain
+        ICP from the pose of the files (icp), or that pose, with centroids aligned (given).
         The search starts at the principal axes, so its result does not depend on the pose of the
         files.  A shape that fits others equally well in two poses is flagged.  Landmarks replace
         the search and the pose from which plain ICP starts.  Use 'given' for aligned data.
     init
+        Initial maps from nearest neighbours of all vertices (dense), from 10 landmarks (landmarks),
+        or as in pyFM from wave kernels of the shapes and of these landmarks (wave_kernels).
         Nearest neighbours are found after ICP.  If poses differ a lot, the best of several initial
         maps is used.
     initial_refinement
+        Refine initial maps by one ZoomOut iteration: in the network and in s4a.match_pair (always),
+        in the network only (network), or never.
         The iteration does not change the size of the map.  Single pairs are matched by
         :func:`s4a.match_pair` (4.1).
+    step
+        Eigenfunctions added in each iteration of ZoomOut.
+    n_latent
+        Dimension of the latent space; by default k.
+    weights
+        Weights of the maps: from their mean cycle errors (cycles), as in pyFM from errors by a
+        linear program (linear_program), or all 1 (equal).
     isometric
+        Before each latent basis of Consistent ZoomOut, replace both maps of a pair by the more
+        orthogonal one and its transpose, as pyFM does.
         The maps are then closer to area-preserving, so the energies of eq. 5 are smaller.  In pyFM
         this is ``isometric`` of ``FMN.zoomout_refine``, which is True by default.
     n_samples
+        Number of farthest-point samples that Consistent ZoomOut matches; 0 for all vertices.
         The number must be at least 2 k.  The initial refinement also uses the samples if pose
         differences are small.
     dense_iterations
+        Final Consistent ZoomOut iterations that also search the vertices around each match.
         Matches between samples alone are only as accurate as the spacing of the samples.  With
         ``n_samples=0`` all vertices are searched anyway.
     norm
+        Norm that selects the median shape: the shape difference with the smallest norm.
         'frobenius' weights all eigenfunctions equally.  'h1' gives fine detail less weight, and
         'h2' even less.  'h2_image' gives fine detail more weight.  'h2_both' gives fine detail less
         weight in the domain and more weight in the image.
         :func:`s4a.method.median.distance_to_identity` has the formulas.
     keep_iterations
+        Store the maps, latent bases and matches of every iteration of Consistent ZoomOut.
         They are the nodes of ``/iterations``.  The descriptors of initial maps are in ``/network``.
         :func:`s4a.match_pair` has the same option for the iterations of ZoomOut.
+    template
+        Name of the shape to register to; by default the median shape.
     dense_match
+        Full-resolution match by the latent bases (eq. 7) or by functional maps (eq. 3 and 4).
         Unless ``refine="intrinsic"``, this match is one of several initialisations.
     refine
+        Refinement of the match: elastic iterations, iterated spectral non-rigid ICP, or none as in
+        the paper (intrinsic).
         Elastic iterations penalise bending and stretch.  If poses differ a lot, spectral non-rigid
         ICP comes first (:mod:`s4a.method.spectral_icp`).  With 'spectral_icp' the best of several
         results is kept.
     articulated
+        If poses differ a lot, spectral non-rigid ICP fits a separate rigid transform to each part,
+        such as a limb.
         Otherwise one rigid transform applies to the whole shape.
     full_resolution_iterations
+        s4a.match_pair and transfer only: ZoomOut iterations that search all source vertices.
         They follow ZoomOut on coarse vertices.  Also used when an external mesh is matched to the
         template.
     bidirectional
+        Transfer only: match pairs in both directions and average the results.
         It is an option of :func:`s4a.register_pairs`.
     displacement_alignment
+        Rigid alignment to the template before displacements are computed: best fit of the
+        registered surface (fitted), or the initial alignment (initial).
         With 'initial', eq. 8 holds as printed in the paper.
+    area_weighted
+        Weight vertices by area when displacements are projected onto U Phi.
     n_projected
+        Number of vertices used to project displacements onto U Phi; 0 for all.
         Vertices near coarse vertices are used.
+    remove_size
+        Align with scaling, so that displacements do not contain size.
+    intersections
+        Count self-intersecting triangles: those that intersect others of the same shape.
     quality_control
+        Suspect (flagged) shapes, such as mirrored ones, are excluded, the run stops, or all shapes
+        are used (off).
         A flagged shape, such as a mirrored one or one in another unit, is left out of the network
         and of the modes.  It is registered afterwards, with the results of the others held fixed.
         With 'stop' the run ends before the long stages.  With 'off' all shapes are in the network
         and the modes, each can be the median, shapes are not compared with each other, and what
         cleaning, alignment and registration find are warnings.
+    include_flagged
+        Include suspect (flagged) shapes in the modes and statistics.
 
     Raises
     ------
@@ -340,153 +412,75 @@ class Options:
     """
 
     # fmt: off
-    preset: str | None = computing(None,
-        "'paper' switches off all additions to the published method; 'fast' halves the time",
-        choices=("paper", "fast"), pair=True)
-    seed: int = computing(0, "seed of all random numbers", of="low resolution", pair=True)
-    pattern: str | None = reading(None,
-        "read only files whose name matches a pattern, such as '*brain*'")
-    components: str | int = reading("largest",
-        "connected components to keep of each mesh: 'largest', 'all' or a number",
-        check=check_components, of="cleaning")
-    strict: bool = reading(False,
-        "exclude shapes with non-finite vertices instead of repairing them", of="cleaning")
-    close_holes: bool = reading(False, "close each hole with a fan of triangles", of="cleaning")
-    label: int | str | None = reading(None,
-        "extract the surface of this label, or of the union of several (1,2), from label volumes "
-        "(NIfTI, MGH, NRRD)",
-        check=check_label, of="cleaning")
-    coordinate_system: str | None = reading(None,
-        "coordinate system of files that state none: RAS, LPS or 'surface RAS, c_ras X Y Z'",
-        of="cleaning", pair=True)
-    unit: str | None = reading(None, "unit of files that state none: um, mm, cm, m or in",
-        check=check_unit, of="cleaning", pair=True)
-    reflect: str | list[str] | None = reading(None,
-        "shapes to mirror: names separated by commas, COLUMN=VALUE of the table, or 'auto'")
-    table: Path | str | None = reading(None,
-        "CSV file with a column 'shape', covariates and groups for the statistics")
-    landmarks: Path | str | None = reading(None,
-        "folder of landmark files, named as the shapes, that guide alignment and elastic "
-        "registration")
-    features: str | list[str] | None = reading(None,
-        "names of scalar fields that guide registration, separated by commas; the field sulc of "
-        "a.ply is read from a.sulc.npy")
-    method: str = network("rematch",
-        "low-resolution shapes: remeshed surfaces (rematch) or local functions (scalable)",
-        choices=("rematch", "scalable"), section="4.1", see="method/scalable", of="low resolution",
+    preset: str | None = computing(None, choices=("paper", "fast"), pair=True)
+    seed: int = computing(0, of="low resolution", pair=True)
+    pattern: str | None = reading(None)
+    components: str | int = reading("largest", check=check_components, of="cleaning")
+    strict: bool = reading(False, of="cleaning")
+    close_holes: bool = reading(False, of="cleaning")
+    label: int | str | None = reading(None, check=check_label, of="cleaning")
+    coordinate_system: str | None = reading(None, of="cleaning", pair=True)
+    unit: str | None = reading(None, check=check_unit, of="cleaning", pair=True)
+    reflect: str | list[str] | None = reading(None)
+    table: Path | str | None = reading(None)
+    landmarks: Path | str | None = reading(None)
+    features: str | list[str] | None = reading(None)
+    method: str = network("rematch", choices=("rematch", "scalable"), section="4.1",
+        see="method/scalable", of="low resolution", pair=True)
+    n_coarse: int = network(N_COARSE, least=100, fast=3000, section="4.1", of="low resolution",
         pair=True)
-    n_coarse: int = network(N_COARSE, "number of vertices of the low-resolution meshes", least=100,
-        fast=3000, section="4.1", of="low resolution", pair=True)
-    sampling: str = network("normals",
-        "samples of the low-resolution meshes: farthest points in position and normal (normals), "
-        "or, as in ReMatching, along the surface, with U from closest points in space (geodesic)",
-        choices=("normals", "geodesic"), section="4.1, step 1", see="method/remesh",
-        of="low resolution", pair=True)
-    wrap: bool = network(False, "wrap the shapes in a watertight surface before remeshing",
-        of="low resolution")
-    refined_eigenfunctions: bool = network(False,
-        "use refined full-resolution eigenfunctions instead of U Phi", paper=False,
-        section="eq. 4, 7, 8", instead="$U \\phi$", see="method/refined_eigenfunctions",
-        of="low resolution", pair=True)
-    k_init: int = network(20, "size of the initial functional maps", least=4, section="5.1",
-        pair=True)
-    k: int = network(100, "size of the refined functional maps", least=4, section="5.1",
-        of="low resolution", pair=True)
-    n_pairs: int = network(500, "number of pairs in the network, each with maps in both directions",
-        least=1, section="5.1")
-    alignment: str = network("search",
-        "rigid alignment: the best of several results of ICP in position and normal (search), "
-        "plain ICP from the pose of the files (icp), or that pose, with centroids aligned (given)",
-        choices=("search", "icp", "given"), paper="icp", section="4.1, step 2",
-        instead="ICP from the pose of the files", see="method/alignment", of="initial maps",
-        pair=True)
-    init: str = network("dense",
-        "initial maps from nearest neighbours of all vertices (dense), from 10 landmarks "
-        "(landmarks), or as in pyFM from wave kernels of the shapes and of these landmarks "
-        "(wave_kernels)",
-        choices=("dense", "landmarks", "wave_kernels"), paper="landmarks",
-        section="4.1, steps 3 and 4",
-        instead="initial map fitted to 10 landmarks", see="method/initial_map", of="initial maps",
-        pair=True)
-    initial_refinement: str = network("always",
-        "refine initial maps by one ZoomOut iteration: in the network and in s4a.match_pair "
-        "(always), in the network only (network), or never",
-        choices=("always", "network", "never"), paper="network", section="4.2",
-        instead="one ZoomOut iteration before Consistent ZoomOut", see="method/initial_map",
-        of="initial maps", given_as="never".__ne__, pair=True)
-    step: int = network(5, "eigenfunctions added in each iteration of ZoomOut", least=1,
-        section="4.2", of="Consistent ZoomOut", pair=True)
-    n_latent: int | None = network(None, "dimension of the latent space; by default k", least=2,
-        section="eq. 3", of="Consistent ZoomOut")
-    weights: str = network("cycles",
-        "weights of the maps: from their mean cycle errors (cycles), as in pyFM from errors by a "
-        "linear program (linear_program), or all 1 (equal)",
-        choices=("cycles", "linear_program", "equal"), section="eq. 3", see="method/network",
+    sampling: str = network("normals", choices=("normals", "geodesic"), section="4.1, step 1",
+        see="method/remesh", of="low resolution", pair=True)
+    wrap: bool = network(False, of="low resolution")
+    refined_eigenfunctions: bool = network(False, paper=False, section="eq. 4, 7, 8",
+        instead="$U \\phi$", see="method/refined_eigenfunctions", of="low resolution", pair=True)
+    k_init: int = network(20, least=4, section="5.1", pair=True)
+    k: int = network(100, least=4, section="5.1", of="low resolution", pair=True)
+    n_pairs: int = network(500, least=1, section="5.1")
+    alignment: str = network("search", choices=("search", "icp", "given"), paper="icp",
+        section="4.1, step 2", instead="ICP from the pose of the files", see="method/alignment",
+        of="initial maps", pair=True)
+    init: str = network("dense", choices=("dense", "landmarks", "wave_kernels"), paper="landmarks",
+        section="4.1, steps 3 and 4", instead="initial map fitted to 10 landmarks",
+        see="method/initial_map", of="initial maps", pair=True)
+    initial_refinement: str = network("always", choices=("always", "network", "never"),
+        paper="network", section="4.2", instead="one ZoomOut iteration before Consistent ZoomOut",
+        see="method/initial_map", of="initial maps", given_as="never".__ne__, pair=True)
+    step: int = network(5, least=1, section="4.2", of="Consistent ZoomOut", pair=True)
+    n_latent: int | None = network(None, least=2, section="eq. 3", of="Consistent ZoomOut")
+    weights: str = network("cycles", choices=("cycles", "linear_program", "equal"), section="eq. 3",
+        see="method/network", of="Consistent ZoomOut")
+    isometric: bool = network(False, section="4.2", see="method/latent", of="Consistent ZoomOut")
+    n_samples: int = network(N_SAMPLES, paper=0, fast=500, section="eq. 3",
+        instead="for all vertices in every iteration", see="method/latent", of="initial maps")
+    dense_iterations: int = network(4, paper=0, fast=0, section="eq. 3", see="method/latent",
         of="Consistent ZoomOut")
-    isometric: bool = network(False,
-        "before each latent basis of Consistent ZoomOut, replace both maps of a pair by the more "
-        "orthogonal one and its transpose, as pyFM does", section="4.2", see="method/latent",
-        of="Consistent ZoomOut")
-    n_samples: int = network(N_SAMPLES,
-        "number of farthest-point samples that Consistent ZoomOut matches; 0 for all vertices",
-        paper=0, fast=500, section="eq. 3", instead="for all vertices in every iteration",
-        see="method/latent", of="initial maps")
-    dense_iterations: int = network(4,
-        "final Consistent ZoomOut iterations that also search the vertices around each match",
-        paper=0, fast=0, section="eq. 3", see="method/latent", of="Consistent ZoomOut")
-    norm: str = network("h2",
-        "norm that selects the median shape: the shape difference with the smallest norm",
-        choices=("h2", "h1", "frobenius", "h2_image", "h2_both"), section="eq. 5",
-        of="Consistent ZoomOut")
-    keep_iterations: bool = network(False,
-        "store the maps, latent bases and matches of every iteration of Consistent ZoomOut",
-        of="Consistent ZoomOut")
-    template: str | None = registration(None,
-        "name of the shape to register to; by default the median shape")
-    dense_match: str = registration("latent",
-        "full-resolution match by the latent bases (eq. 7) or by functional maps (eq. 3 and 4)",
-        choices=("latent", "fmap"), section="4.2")
-    refine: str = registration("elastic",
-        "refinement of the match: elastic iterations, iterated spectral non-rigid ICP, or none as "
-        "in the paper (intrinsic)",
-        choices=("elastic", "spectral_icp", "intrinsic"), paper="intrinsic", section="eq. 7, 4",
-        instead="the match as it is", see="method/elastic", of="registration", pair=True)
-    articulated: bool = registration(True,
-        "if poses differ a lot, spectral non-rigid ICP fits a separate rigid transform to each "
-        "part, such as a limb",
-        paper=False, section="eq. 8", see="method/deform", of="registration", pair=True)
-    full_resolution_iterations: int = registration(1,
-        "s4a.match_pair and transfer only: ZoomOut iterations that search all source vertices",
-        paper=0, section="eq. 4", instead="after ZoomOut on coarse vertices", see="method/register",
-        pair=True)
-    bidirectional: bool = registration(True,
-        "transfer only: match pairs in both directions and average the results",
-        paper=False, section="6.2", instead="a template registered to a shape",
-        see="study/pair", pair=True)
-    displacement_alignment: str = registration("fitted",
-        "rigid alignment to the template before displacements are computed: best fit of the "
-        "registered surface (fitted), or the initial alignment (initial)",
-        choices=("fitted", "initial"), paper="initial", section="eq. 8",
-        instead="after ICP (4.1, step 2)", see="method/deform", of="registration", pair=True)
-    area_weighted: bool = registration(True,
-        "weight vertices by area when displacements are projected onto U Phi", paper=False,
-        section="after eq. 8", instead="$(U \\phi)^\\dagger$ as printed", see="method/deform",
-        of="projection", pair=True)
-    n_projected: int = registration(N_CENTRAL,
-        "number of vertices used to project displacements onto U Phi; 0 for all", paper=0,
-        section="after eq. 8", instead="on all vertices", see="method/shape", of="projection",
-        pair=True)
-    remove_size: bool = registration(False, "align with scaling, so that "
-        "displacements do not contain size", of="registration")
-    intersections: bool = quality(True,
-        "count self-intersecting triangles: those that intersect others of the same shape")
-    quality_control: str = quality("exclude",
-        "suspect (flagged) shapes, such as mirrored ones, are excluded, the run stops, or "
-        "all shapes are used (off)",
-        choices=("exclude", "stop", "off"), paper="off", section="4.2", instead="all shapes",
-        see="study/quality_control")
-    include_flagged: bool = quality(False,
-        "include suspect (flagged) shapes in the modes and statistics")
+    norm: str = network("h2", choices=("h2", "h1", "frobenius", "h2_image", "h2_both"),
+        section="eq. 5", of="Consistent ZoomOut")
+    keep_iterations: bool = network(False, of="Consistent ZoomOut")
+    template: str | None = registration(None)
+    dense_match: str = registration("latent", choices=("latent", "fmap"), section="4.2")
+    refine: str = registration("elastic", choices=("elastic", "spectral_icp", "intrinsic"),
+        paper="intrinsic", section="eq. 7, 4", instead="the match as it is", see="method/elastic",
+        of="registration", pair=True)
+    articulated: bool = registration(True, paper=False, section="eq. 8", see="method/deform",
+        of="registration", pair=True)
+    full_resolution_iterations: int = registration(1, paper=0, section="eq. 4",
+        instead="after ZoomOut on coarse vertices", see="method/register", pair=True)
+    bidirectional: bool = registration(True, paper=False, section="6.2",
+        instead="a template registered to a shape", see="study/pair", pair=True)
+    displacement_alignment: str = registration("fitted", choices=("fitted", "initial"),
+        paper="initial", section="eq. 8", instead="after ICP (4.1, step 2)", see="method/deform",
+        of="registration", pair=True)
+    area_weighted: bool = registration(True, paper=False, section="after eq. 8",
+        instead="$(U \\phi)^\\dagger$ as printed", see="method/deform", of="projection", pair=True)
+    n_projected: int = registration(N_CENTRAL, paper=0, section="after eq. 8",
+        instead="on all vertices", see="method/shape", of="projection", pair=True)
+    remove_size: bool = registration(False, of="registration")
+    intersections: bool = quality(True)
+    quality_control: str = quality("exclude", choices=("exclude", "stop", "off"), paper="off",
+        section="4.2", instead="all shapes", see="study/quality_control")
+    include_flagged: bool = quality(False)
     # fmt: on
 
     def __new__(cls, **given: Any) -> Self:
@@ -702,9 +696,9 @@ def _entry(one):
     kinds = kinds.replace("NoneType", "None")
     kind = f"{{{', '.join(map(repr, meta['choices']))}}}" if meta["choices"] else kinds
     presets = "".join(f", {name} {value!r}" for name, value in meta["presets"].items())
-    text = f"{meta['help'][0].upper()}{meta['help'][1:]}"
+    text = f"{HELP[one.name][0].upper()}{HELP[one.name][1:]}"
     text += f" ({meta['section']})." if meta["section"] else "."
-    text += f"  {NOTES[one.name]}" if one.name in NOTES else ""
+    text += f"  {NOTES[one.name]}" if NOTES[one.name] else ""
     module = meta["see"].replace("/", ".")
     text += f"  See :mod:`s4a.{module}`." if module else ""
     lines = textwrap.wrap(text, 92, break_on_hyphens=False, break_long_words=False)
@@ -714,13 +708,16 @@ def _entry(one):
 
 
 _DOCUMENTED = inspect.getdoc(Options) or ""
-# what the docstring says of an option in addition to its help
-NOTES = {
-    name: " ".join(text.split())
-    for name, text in re.findall(r"^(\w+)\n((?:    .+\n)+)", _DOCUMENTED, re.MULTILINE)
-    if name in DECLARED
-}
-if NOTES:  # not with python -OO
+# of each option, from the docstring: the first sentence, for a flag, and further ones
+HELP, NOTES = dict.fromkeys(DECLARED, ""), dict.fromkeys(DECLARED, "")
+for name, text in re.findall(r"^(\w+)\n((?:    .+\n)+)", _DOCUMENTED, re.MULTILINE):
+    if name in DECLARED:
+        sentence, _, rest = text.strip().partition(".\n")
+        sentence = " ".join(sentence.removesuffix(".").split())
+        is_name = sentence[:2].isupper()
+        HELP[name] = sentence if is_name else sentence[0].lower() + sentence[1:]
+        NOTES[name] = " ".join(rest.split())
+if any(HELP.values()):  # not with python -OO
     before, _, after = _DOCUMENTED.partition("preset\n")
     entries = "\n".join(map(_entry, DECLARED.values()))
     Options.__doc__ = before + entries + after[after.index("\n\nRaises") :]

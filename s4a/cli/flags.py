@@ -12,7 +12,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
-from s4a.options import DECLARED
+from s4a.options import DECLARED, HELP
 
 MOST_PROCESSES = 1000  # a mistyped number starts no million of them
 # a parameter in a docstring: name, placeholder of its value, help
@@ -182,7 +182,7 @@ def add_options(add: Callable[..., Any], names: Sequence[str], *, unset: bool = 
             found = [metavars[kind] for kind in get_args(option.type) if kind in metavars]
             settings["metavar"] = "N" if settings["type"] is whole else (*found, name.upper())[0]
         settings["default"] = None if unset else option.default
-        settings["help"] = with_default(option.metadata["help"], default)
+        settings["help"] = with_default(HELP[name], default)
         add(*flag_names(name), group=option.metadata["group"], **settings)
     if "n_jobs" in names:
         settings = {"type": processes, "metavar": "N", "default": -1, "group": last}
