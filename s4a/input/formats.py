@@ -18,6 +18,7 @@ import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -376,31 +377,11 @@ class _Format:
     scalars: bool = False
 
 
-# other files that are found among meshes, by their first bytes
-_MAGICS = {
-    "an HDF5 file": rb"\x89HDF\r\n\x1a\n",
-    "a MATLAB file": rb"MATLAB \d",
-    "a glTF file": rb"glTF|\s*\{.*\"asset\"\s*:",
-    "a DICOM file": rb".{128}DICM",
-    "a MetaImage or MRtrix volume": rb"ObjectType\s*=|mrtrix image",
-    "an FBX, Blender or Gmsh file": rb"Kaydara FBX|; FBX |BLENDER|\$MeshFormat",
-    "a STEP or IGES file": rb"ISO-10303|[ -~]{72}S +1\s",
-    "a USD, VRML, Inventor or Draco file": rb"PXR-USDC|#usda|#VRML|#Inventor|DRACO",
-    "an Amira or BrainSuite file": rb"# (Avizo|AmiraMesh|HyperSurface)|DFS_[LB]E",
-    "a streamlines file": rb"TRACK\0|mrtrix tracks",
-    "values per vertex, or quadrangles, of FreeSurfer": rb"\xff\xff[\xff\xfd]",
-    "a surface of FreeSurfer as text": rb"#!ascii",
-    "a BrainVISA mesh": rb"(ascii|binar)(DCBA|ABCD)",
-    "a binary MNI surface": rb"p[\0-\xff]{3}[\x3c-\x3f]",
-    "an NPY array": rb"\x93NUMPY",
-    "a picture": rb"\x89PNG|\xff\xd8\xff|GIF8|II\*\0|MM\0\*",
-    "a PDF file": rb"%PDF",
-    "a compressed file: unpack it": rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|\x28\xb5\x2f\xfd|Rar!",
-    "a pointer of Git LFS: git lfs pull downloads the file": rb"version https://git-lfs",
-    "a web page: download the file again": rb"(?i)\s*<(.{0,1000}<)?(!doctype )?(html|head)\b",
-    "a COLLADA or X3D file": rb"\s*<.{0,1000}<(COLLADA|X3D)\b",
-    "a program": rb"\x7fELF|MZ[\x80-\xff]",
-}
+# other files that are found among meshes -> regular expression of their first bytes
+_MAGICS = dict(
+    line.split(" | ", 1)
+    for line in Path(__file__).with_name("magics.txt").read_text(encoding="utf-8").splitlines()[1:]
+)
 
 
 def format_of(data: bytes) -> str:
@@ -425,7 +406,9 @@ def format_of(data: bytes) -> str:
         return "STL"
     if is_utf_16(data):
         raise ValueError("text in UTF-16 found: save it as UTF-8")
-    other = next((kind for kind, magic in _MAGICS.items() if re.match(magic, data, re.DOTALL)), "")
+    other = next(
+        (kind for kind, magic in _MAGICS.items() if re.match(magic.encode(), data, re.DOTALL)), ""
+    )
     if not other and _is_binary_stl(data):
         return "STL"
     if not other and b"\0" not in head and re.search(rb"^[ \t]*v[ \t]+[-+.\dn]", data, re.M):
