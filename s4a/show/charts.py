@@ -14,6 +14,7 @@ from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, PercentFormatter
+from matplotlib.transforms import Bbox
 
 from s4a.geometry.mesh import as_arrays
 from s4a.schema import Array
@@ -197,57 +198,31 @@ def shortened(names: list[str], length: int = 16) -> list[str]:
     return [name if len(name) <= length else f"{name[: half - 1]}…{name[-half:]}" for name in cut]
 
 
-def _free_corner(point, size, limits, taken, outward):
-    """Return offsets right and up, in points, for a label of a `size` next to its point.
+def _write_names(figure, axes, positions, names):
+    """Write names next to their points where they overlap nothing, and omit the others.
 
-    Four corners are tried, first those in the direction `outward`, where fewer edges end::
-
-        2 | 1     None if a label in each of them exceeds the horizontal `limits` or overlaps
-        --+--     a box in `taken`.
-        4 | 3
+    The chart must be complete, as the places of points and the sizes of names are in pixels.  Of
+    the four corners around a point, those away from the centre are tried first.
     """
-    x, y = point
-    width, height = size
-    corners = ((3, 3), (-3 - width, 3), (3, -3 - height), (-3 - width, -3 - height))
-    for right, up in sorted(corners, key=lambda corner: -np.sign(corner) @ outward):
-        low, bottom = x + right, y + up
-        clear = (taken[:, 2] < low) | (low + width < taken[:, 0])
-        clear |= (taken[:, 3] < bottom) | (bottom + height < taken[:, 1])
-        if limits[0] <= low and low + width <= limits[1] and clear.all():
-            return right, up
-    return None
-
-
-def _names(ax, positions, names):
-    """Write names next to their points where they overlap nothing, and omit the others."""
-    size = 8 if len(names) <= 12 else 6
-    inches = ax.figure.get_size_inches() / [len(ax.figure.axes), 1]
-    width, height = 72 * inches  # in points, like fonts
-    span = np.ptp(positions, axis=0)
-    at = (positions - positions.min(0)) / np.where(span > 0, span, 1) * 0.68 * [width, height]
-    limits = -0.06 * width, 0.74 * width
-    taken = np.concatenate([at - 3, at + 3], axis=1)  # left, bottom, right, top
-    for i, name in enumerate(shortened(names)):
-        label = np.array([0.58 * size * len(name), size])
-        others = np.delete(taken, i, axis=0)  # a label may touch its own point
-        offset = _free_corner(at[i], label, limits, others, at[i] - at.mean(0))
-        if offset is None:
-            continue
-        corner = at[i] + offset
-        taken = np.vstack([taken, [*corner, *(corner + label)]])
-        right, up = offset
-        ax.annotate(
-            name,
-            positions[i],
-            (np.copysign(3, right), up),
-            textcoords="offset points",
-            ha="left" if right > 0 else "right",
-            fontsize=size,
-            color="#333333",
-            zorder=4,
-            parse_math=False,
-            path_effects=[withStroke(linewidth=2, foreground="white")],  # over edges
-        )
+    figure.draw_without_rendering()
+    outline = withStroke(linewidth=2, foreground="white")  # over edges
+    style = {"color": "#333333", "zorder": 4, "parse_math": False, "path_effects": [outline]}
+    style |= {"fontsize": 8 if len(names) <= 12 else 6, "textcoords": "offset points"}
+    for ax, points in zip(axes, positions, strict=True):
+        at = ax.transData.transform(points)
+        taken = [Bbox([point - 4, point + 4]) for point in at]
+        for i, name in enumerate(shortened(names)):
+            outward = np.sign(at[i] - at.mean(0))
+            corners = [(3, 3), (-3, 3), (3, -3), (-3, -3)]
+            for right, up in sorted(corners, key=lambda corner: -outward @ corner):
+                side = {"ha": "left" if right > 0 else "right", "va": "bottom" if up > 0 else "top"}
+                text = ax.annotate(name, points[i], (right, up), **side, **style)
+                box = text.get_window_extent()
+                others = taken[:i] + taken[i + 1 :]  # it may touch its own point
+                if ax.bbox.x0 < box.x0 and box.x1 < ax.bbox.x1 and not box.count_overlaps(others):
+                    taken.append(box)
+                    break
+                text.remove()
 
 
 def network(
@@ -296,7 +271,6 @@ def network(
         if highlight is not None:
             ring = {"facecolor": "none", "edgecolor": ORANGE, "linewidth": 2}
             ax.scatter(*positions[highlight], s=90, zorder=3, **ring)
-        _names(ax, positions, names)
         if np.isfinite(value).any():
             title = f"{title}, median {np.nanmedian(value):.3g}"
         ax.set_title(title)
@@ -307,6 +281,7 @@ def network(
     ticks = np.geomspace(*limits, 5)
     bar.ax.minorticks_off()
     bar.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks])
+    _write_names(figure, axes, [positions] * len(axes), names)
     return figure
 
 
@@ -438,7 +413,7 @@ def scores(
     >>> scores(score, list("abcdefgh"), highlight=2, faint=[False] * 7 + [True])
     <Figure ...>
     """
-    planes = [(a, b) for a, b in ((0, 1), (0, 2)) if b < score.shape[1]] or [(0, 0)]
+    planes = [[a, b] for a, b in ((0, 1), (0, 2)) if b < score.shape[1]] or [[0, 0]]
     figure, (axes,) = _figure(4.2 * len(planes), 3.8, len(planes))
     colors = np.where(np.arange(len(score)) == highlight, ORANGE, BLUE)
     colors = np.where(np.zeros(len(score), bool) if faint is None else faint, PALE, colors)
@@ -446,9 +421,9 @@ def scores(
         ax.axhline(0, color="#dddddd", lw=1)
         ax.axvline(0, color="#dddddd", lw=1)
         ax.scatter(score[:, a], score[:, b], color=colors, s=20, zorder=2)
-        _names(ax, score[:, [a, b]], names)
         ax.set(xlabel=f"PC{a + 1} (sd)", ylabel=f"PC{b + 1} (sd)")
         ax.margins(0.12)
+    _write_names(figure, axes, [score[:, plane] for plane in planes], names)
     return figure
 
 
