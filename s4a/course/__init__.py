@@ -5,8 +5,7 @@ normals, closest points, and KnnSearch.
 """
 
 from s4a.course import diagrams
-from s4a.course.exercises import check, judge
-from s4a.course.quizzes import quiz
+from s4a.course.exercises import check, judge, quiz
 from s4a.course.sliders import slide, takeaway
 from s4a.geometry.closest import closest_point
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, vertex_areas, vertex_normals

@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from s4a.course import check, diagrams, judge, quiz, slide, takeaway
-from s4a.course.exercises import EXERCISES
-from s4a.course.quizzes import SOURCE, Quiz, read
+from s4a.course.exercises import EXERCISES, HERE, Quiz, read
 from s4a.datasets.synthetic import sphere
 from s4a.method.latent import consistency_form
 from s4a.show.charts import PALE, matrices, network, on_circle, surfaces, variance
@@ -181,7 +180,7 @@ def test_maps_of_unknown_error_are_grey_lines_below_the_others():
         assert (np.ptp(colors[n:, :3], axis=1) > 0.1).all()
 
 
-LESSONS = read(SOURCE.read_text(encoding="utf-8"))
+LESSONS = read((HERE / "quizzes.md").read_text(encoding="utf-8"))
 each_quiz = pytest.mark.parametrize("lesson", LESSONS)
 
 
