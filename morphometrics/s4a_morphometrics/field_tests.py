@@ -4,10 +4,9 @@ from typing import TYPE_CHECKING
 
 import xarray as xr
 
-from s4a.analysis.effects import compare_groups, map_groups, regress
 from s4a.analysis.inputs import Values
 from s4a.analysis.permutation import check_options
-from s4a.analysis.statistics import classify_sample
+from s4a.analysis.statistics import classify_sample, compare_groups, map_groups, regress
 from s4a.seeds import RNG, seed_of
 from s4a_morphometrics.fields import field_sample
 

@@ -16,16 +16,16 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from s4a.analysis.effects import (
+from s4a.analysis.inputs import Values, lacks_value, registration_of, sample_of, values_of
+from s4a.analysis.model import count_components
+from s4a.analysis.permutation import Model, check_options, standardize
+from s4a.analysis.statistics import (
     fields_to_test,
     freed_deviation,
     numbers_of,
     squared_cohen_f,
     vertex_results,
 )
-from s4a.analysis.inputs import Values, lacks_value, registration_of, sample_of, values_of
-from s4a.analysis.model import count_components
-from s4a.analysis.permutation import Model, check_options, standardize
 from s4a.input.columns import check_column
 from s4a.input.subjects import listed
 from s4a.method.pca import gram, principal_components

@@ -58,8 +58,8 @@ def insert(args: Namespace) -> int:
 
 def compare(args: Namespace) -> int:
     """Analyse the variation of structures in relative pose and in shape."""
-    from s4a.analysis.effects import group_test
     from s4a.analysis.export import write_results, write_scores
+    from s4a.analysis.statistics import group_test
     from s4a.show.page import write_page
     from s4a.study.tree import open_inserted
     from s4a_morphometrics import poses, structures_tables

@@ -12,9 +12,9 @@ import math
 import numpy as np
 import xarray as xr
 
-from s4a.analysis.effects import modes_study
 from s4a.analysis.inputs import Values, registration_of
 from s4a.analysis.permutation import check_permutations, design, p_values
+from s4a.analysis.statistics import modes_study
 from s4a.method.pca import gram, principal_components
 from s4a.schema import FIELD_UNIT, check_count, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
