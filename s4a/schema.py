@@ -40,10 +40,14 @@ def _cells(table, n):
 
 
 _VARIABLES, _FILES = Path(__file__).with_name("schema.txt").read_text("utf-8").split("\n\n")
+_ROWS = _cells(_VARIABLES, 4)
 ROWS: dict[str, tuple[str, str, str]] = {
-    name: (dims, _UNITS.get(unit, unit), meaning)
-    for name, dims, unit, meaning in _cells(_VARIABLES, 4)
+    name: (dims, ONE if " index" in unit else _UNITS.get(unit, unit), meaning)
+    for name, dims, unit, meaning in _ROWS
 }
+# index variables and the dim that they refer to; -1 refers to nothing
+POINTS_INTO = {name: unit.split()[0] for name, _, unit, _ in _ROWS if " index" in unit}
+NOWHERE = {name for name, _, unit, _ in _ROWS if unit.endswith("-1")}
 # required contents of a file of a study: variables, text attributes, numeric attributes, and
 # dims with another file and its dim of the same size; {template} is that of the registration
 HOLDS = {kind: tuple(contents) for kind, *contents in _cells(_FILES, 5)}
@@ -82,19 +86,6 @@ class Table(dict[str, tuple[tuple[str, ...], str, str]]):
 
 
 TABLE = Table(ROWS)
-
-# index variables and the dim that they refer to; -1 refers to nothing
-_OF_DIM = {
-    "vertex": "corner_vertex edge_vertex vertex_of_file coarse_vertex guide_vertex "
-    "sample_cell local_sample algorithm_reverse",
-    "file_vertex_index": "file_vertex",
-    "original_vertex": "sample_vertex local_vertex registered_match",
-    "triangle": "template_triangle",
-    "source_vertex": "algorithm_match true_match",
-}
-POINTS_INTO = {name: dim for dim, names in _OF_DIM.items() for name in names.split()}
-NOWHERE = {"vertex_of_file", "sample_vertex", "true_match"}
-
 
 OMITTED = ("shape", "pair", "iteration")  # leading dims that a file of one of them lacks
 TEXTS = set("source target status reason warning path coordinate_system shape stage".split())

@@ -26,7 +26,7 @@ from s4a.geometry.mesh import (
     unique_edges,
 )
 from s4a.options import check_components
-from s4a.schema import Array, require
+from s4a.schema import TABLE, Array, require
 
 # share of the bounding-box diagonal within which vertices are welded and triangles are flat
 _RELATIVE_TOLERANCE = 1e-7
@@ -38,20 +38,12 @@ LARGEST = 1e15
 _FARTHEST = {"float32": 1e5, "float64": 1e11}
 
 REPAIRS = {
-    "nonfinite_vertices": "non-finite vertices removed",
-    "welded_vertices": "vertices welded",
-    "degenerate_triangles": "triangles with repeated corners dropped",
-    "duplicate_triangles": "duplicate triangles dropped",
-    "flipped_edges": "edges of zero-area triangles flipped",
-    "flat_triangles": "zero-area triangles dropped",
-    "nonmanifold_edges": "non-manifold edges separated",
-    "cut_edges": "sides of edges cut open",
-    "split_vertices": "vertices added by splitting non-manifold ones",
-    "inserted_vertices": "vertices inserted on double edges",
-    "reoriented_triangles": "triangles reoriented",
-    "dropped_components": "components dropped",
-    "unreferenced_vertices": "vertices without triangles dropped",
-    "closed_holes": "holes closed",
+    name: TABLE[name][2]
+    for name in (
+        "nonfinite_vertices welded_vertices degenerate_triangles duplicate_triangles flipped_edges "
+        "flat_triangles nonmanifold_edges cut_edges split_vertices inserted_vertices "
+        "reoriented_triangles dropped_components unreferenced_vertices closed_holes"
+    ).split()
 }
 
 
