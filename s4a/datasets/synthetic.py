@@ -8,8 +8,8 @@ position of every reference point (a point of the unit sphere) on every shape.  
 RAS: x to the right, y to the front, z up.
 """
 
+import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -127,44 +127,12 @@ _TUMOUR = (4.0, 7.0)  # mm, smallest and largest height, on a third of the shape
 _POSE = (10.0, 8.0)  # largest rotation in degrees, standard deviation of the translation in mm
 _SEMI_AXES = np.array([64.0, 86.0, 61.0])
 
-# Centre, width, translation, rotation and mirror of the fields of each mode, on the right side; a
-# mirror of 1 repeats the field on the left as in a mirror, -1 with the opposite sign, 0 does not.
-MODES: list[list[Any]] = [
-    [((62, 0, 5), 44, (0, 0, 0), (1, 0, 0), 1)],
-    [((0, 60, 10), 38, (0, 0, 0), (0, 1, 0), 0), ((0, -60, 10), 38, (0, 0, 0), (0, -1, 0), 0)],
-    [
-        ((45, 30, -28), 28, (0, 1, 0.2), (0, 0, 0), 1),
-        ((25, -55, -30), 28, (-0.8, 0, 0.6), (0, 0, 0), 1),
-    ],
-    [((30, -45, 45), 28, (1, 0, -1), (0, 0, 0), -1)],
-    [((30, 55, 25), 26, (0, 0, 0), (0.3, 1, 0.3), 1)],
-    [((55, -40, 0), 26, (0, 0, 0), (1, 0, 0), -1)],
-]
-_REGIONS = {
-    "frontal pole": (0.3, 0.95, 0.1),
-    "superior frontal": (0.3, 0.55, 0.75),
-    "inferior frontal": (0.75, 0.6, 0.1),
-    "precentral": (0.5, 0.12, 0.85),
-    "parietal": (0.55, -0.35, 0.75),
-    "supramarginal": (0.9, -0.25, 0.3),
-    "temporal": (0.85, 0.15, -0.45),
-    "occipital": (0.35, -0.92, 0.1),
-    "cerebellum": (0.4, -0.65, -0.65),
-    "base": (0.2, 0.25, -0.95),
-}
+# directions of regions and landmarks, and the fields of each mode on the right side: centre, width,
+# translation, rotation and mirror; a mirror of 1 repeats the field on the left as in a mirror, -1
+# with the opposite sign, 0 does not
+_BRAIN = json.loads(Path(__file__).with_name("brain.json").read_text(encoding="utf-8"))
+MODES, _REGIONS, LANDMARKS = _BRAIN["modes"], _BRAIN["regions"], _BRAIN["landmarks"]
 LABELS = ["unknown", *(f"{region} {side}" for side in ("left", "right") for region in _REGIONS)]
-LANDMARKS = {
-    "frontal pole left": (-0.25, 0.95, 0.1),
-    "frontal pole right": (0.25, 0.95, 0.1),
-    "occipital pole left": (-0.25, -0.95, 0.1),
-    "occipital pole right": (0.25, -0.95, 0.1),
-    "temporal pole left": (-0.7, 0.6, -0.4),
-    "temporal pole right": (0.7, 0.6, -0.4),
-    "lateral left": (-1.0, -0.1, 0.1),
-    "lateral right": (1.0, -0.1, 0.1),
-    "vertex": (0.1, 0.0, 1.0),
-    "brainstem": (0.0, -0.36, -0.93),
-}
 
 
 def _bump(u, centre, sharpness):
