@@ -23,7 +23,7 @@ from s4a.method.alignment import N_VOTERS
 from s4a.method.network import choose_pairs, spectral_distance
 from s4a.method.pca import pca_without
 from s4a.method.remesh import check_wrap
-from s4a.options import Options, given_options
+from s4a.options import DECLARED, Options, given_options
 from s4a.schema import POSE, dataset
 from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
 from s4a.study.processes import limited
@@ -165,18 +165,7 @@ def analyse(
     >>> paper = s4a.analyse(brains, preset="paper", **small)
     >>> elastic = s4a.analyse(brains, **PRESETS["paper"] | {"refine": "elastic"}, **small)
     """
-    named = {
-        "preset": preset,
-        "n_coarse": n_coarse,
-        "n_pairs": n_pairs,
-        "k": k,
-        "label": label,
-        "reflect": reflect,
-        "table": table,
-        "landmarks": landmarks,
-        "template": template,
-        "remove_size": remove_size,
-    }
+    named = {name: value for name, value in locals().items() if name in DECLARED}
     given = {name: value for name, value in named.items() if value is not None}
     settings = given_options(given | others, options)
     if store is None:
