@@ -41,8 +41,7 @@ from s4a.method.alignment import IDENTITY, pair_transform, transform_onto
 from s4a.method.initial_map import map_after_alignment
 from s4a.method.register import latent_functions, log_area_ratio, match_functions, match_low
 from s4a.method.shape import Basis, Shape
-from s4a.options import PRESETS as STUDY_PRESETS
-from s4a.options import Options, apply_preset
+from s4a.options import DECLARED, Options, apply_preset
 from s4a.schema import Array, check_choice, check_count, check_rows, check_switch, dataset, variable
 from s4a.seeds import RNG, seed_of
 
@@ -462,16 +461,8 @@ def compare_collection(
     ('algorithm', 'dense_match', 'shape')
     """
     check_some(methods, COLLECTION_METHODS)
-    given: dict[str, Any] = {
-        "init": init,
-        "n_samples": n_samples,
-        "dense_iterations": dense_iterations,
-        "alignment": None,
-    }
-    presets = {name: {key: STUDY_PRESETS[name][key] for key in given} for name in (None, "paper")}
-    given = apply_preset(preset, given, presets) | {"seed": seed_of(seed, rng)}
-    given |= {"n_coarse": n_coarse, "n_pairs": n_pairs, "k_init": k_init, "k": k, "step": step}
-    options = Options(**given)
+    given = {name: value for name, value in locals().items() if name in DECLARED}
+    options = Options(**given | {"seed": seed_of(seed, rng)})
     begin = time.process_time()
     tree = shapes if isinstance(shapes, xr.DataTree) else read_shapes(shapes)
     load = time.process_time() - begin
