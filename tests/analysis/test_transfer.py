@@ -501,26 +501,6 @@ def test_curves_of_slicer_and_of_tables_come_out_of_their_files_in_order(tmp_pat
         read_landmarks(tmp_path / "one.csv")
 
 
-def test_lps_landmarks_are_located_on_a_ras_mesh(meshes):
-    mesh = meshes["brain_01"]
-    assert mesh.attrs["coordinate_system"] == "RAS"
-    X = mesh["position"].values[:40]
-    mirrored = dataset(
-        landmark_name=np.array([str(i) for i in range(40)]), landmark_position=X * [-1, -1, 1]
-    )
-    mirrored.attrs["coordinate_system"] = "LPS"
-    unknown = mesh.assign_attrs(coordinate_system="")
-    for surface in (
-        mesh,
-        unknown,
-    ):  # where the mesh says nothing, the frame in which the landmarks fit
-        found = locate(mirrored, surface)
-        assert found["landmark_position"].values == pytest.approx(X)
-        assert found["landmark_distance"].values == pytest.approx(0, abs=1e-9)
-    with pytest.raises(ValueError, match="RAS, LPS"):
-        locate(mirrored.assign_attrs(coordinate_system="RAS"), mesh, farthest=0.001)
-
-
 def test_landmarks_off_the_surface_are_projected_onto_it_and_the_distance_is_reported():
     mesh = synthetic.sphere(2000)
     given = dataset(landmark_name=np.array(["a"]), landmark_position=np.array([[0, 0, 1.05]]))

@@ -17,7 +17,6 @@ from s4a.input.chirality import in_file
 from s4a.input.coordinates import CoordinateSystem, common, in_one_system, transform
 from s4a.input.formats import vtk_bytes, vtp_bytes
 from s4a.input.landmarks import locate
-from s4a.input.raw import sentences
 from s4a.schema import dataset, in_unit
 from s4a.study.pair import pair_study
 
@@ -401,12 +400,6 @@ def test_written_markups_lie_where_the_scan_has_them(tmp_path):
         assert found.attrs == system("RAS").attrs
         assert found["landmark_position"].values == pytest.approx(X[:3])
         assert np.linalg.det(M[:3, :3]) == pytest.approx(factor**3)
-
-
-def test_messages_end_at_the_end_of_a_sentence():
-    text = "3 of 6 shapes were converted to RAS (a; b), and the others were not; c. And so on."
-    ends = {sentences(text, n) for n in range(1, 100)}
-    assert ends == {text[: text.index(";", 60)], text[: text.index(" And")], text}
 
 
 def test_the_command_prints_the_system_of_each_file(tmp_path, capsys):

@@ -291,12 +291,6 @@ def test_the_same_call_gives_the_same_result_and_leaves_its_input():
     assert not coarsen(mesh, n_coarse=300, seed=1).identical(coarsen(mesh, n_coarse=300))
 
 
-def test_the_spectrum_of_a_coarse_sphere_is_that_of_the_sphere():
-    eigenvalue = spectrum(coarsen(as_dataset(*sphere(6)), n_coarse=3000), k=16)["eigenvalue"].values
-    expected = np.repeat([0, 2, 6, 12], [1, 3, 5, 7]) * 4 * np.pi
-    np.testing.assert_allclose(eigenvalue, expected, rtol=0.01, atol=1e-6)
-
-
 def test_a_mesh_that_is_small_enough_is_kept():
     X, T = sphere(3)
     coarse = coarsen(as_dataset(X, T), n_coarse=300)

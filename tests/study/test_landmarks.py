@@ -109,16 +109,6 @@ def test_three_landmarks_say_how_a_shape_lies_that_its_form_does_not_tell(n):
     assert np.allclose(R, turn if n == 3 else np.eye(3), atol=0.15)
 
 
-def test_three_landmarks_on_a_line_say_nothing_of_turns_about_it():
-    mesh = synthetic.ellipsoid(600)
-    X = mesh["position"].values
-    near = [int(np.argmin(np.linalg.norm(X - [x, 0, 0], axis=1))) for x in (-3, 3)]
-    row = points(X[[near[0], near[1], near[0]]] + [[0, 0, 0], [0, 0, 0], [0.01, 0, 0]])
-    low = Shape(coarse=low_resolution(with_landmarks(mesh, row), n_coarse=300, k=10)).low
-    R, _ = transform_onto(low, low)
-    assert np.allclose(R, np.eye(3), atol=0.02)  # of ICP, as without
-
-
 def test_names_that_are_there_twice_are_refused_and_points_of_curves_left_out(brains):
     (template, _), (on_template, _) = brains
     with pytest.raises(ValueError, match="unique names needed, found 'a' 2 times"):

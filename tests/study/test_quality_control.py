@@ -251,14 +251,6 @@ def test_a_shape_that_makes_a_mode_alone_and_a_near_copy_are_named():
         assert "nearly the same shape as s5" in check_modes(modes_of(copy), 1.0)["s1"][0].words
 
 
-def test_a_shape_that_makes_a_mode_alone_is_in_the_summary(study):
-    report = study["report"].to_dataset()
-    kinds = ["influential" if name == "brain_01" else "" for name in report["shape"].values]
-    other = study.copy()
-    other["report"] = xr.DataTree(report.assign(warning_kinds=("shape", kinds)))
-    assert "1 influential  brain_01  -> it dominates a mode" in tables.run_summary(other)
-
-
 def test_at_most_one_in_a_hundred_clean_collections_has_a_warning_of_its_modes():
     rng = np.random.default_rng(1)
     size = 0.03 * 0.7 ** np.arange(10)

@@ -350,13 +350,6 @@ def test_what_is_no_file_in_a_study_is_not_written_to(folder, tmp_path, capsys, 
     assert (tmp_path / "diary").read_text() == "mine"
 
 
-def test_a_damaged_study_is_no_traceback_for_a_command(folder, capsys):
-    path = folder / "pca.nc"
-    path.write_bytes(path.read_bytes()[:9000])
-    assert cli.main(["statistics", str(folder)]) == 2
-    assert "pca.nc cannot be read" in capsys.readouterr().err
-
-
 def test_a_report_of_somebody_else_in_a_study_is_not_overwritten(tmp_path):
     (tmp_path / ".lock").touch()
     synthetic.sphere(50).to_netcdf(tmp_path / "report.nc", engine="h5netcdf")
