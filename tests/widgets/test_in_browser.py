@@ -8,7 +8,6 @@ import sys
 import pytest
 from paths import ROOT, TESTS
 
-
 pytest.importorskip("anywidget")
 
 
