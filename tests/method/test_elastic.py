@@ -7,6 +7,7 @@ import pytest
 import scipy.linalg
 
 from s4a import match_pair, synthetic
+from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.closest import distance_to_surface
 from s4a.geometry.mesh import (
     as_arrays,
@@ -238,8 +239,7 @@ def test_less_stiff_iterations_are_more_accurate_for_a_strained_template(monkeyp
 
     def registered():
         found = match_pair(shape, template, n_coarse=600, k=50)
-        image = template["position"] + found["displacement"] - found["translation"]
-        image = image.values @ found["rotation"].values / found["scale"].item()
+        image = image_in_shape(template["position"].values, found)
         torn = np.quantile(abs(found["distortion"]), 0.99)
         return found.attrs["initialisation"], torn, np.linalg.norm(image - true, axis=1).mean()
 

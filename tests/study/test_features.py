@@ -5,6 +5,7 @@ import pytest
 from small import OPTIONS
 
 import s4a
+from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays, as_dataset
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.shape import Shape, common_fields
@@ -21,13 +22,9 @@ def egg(twist=0.0, n=1500):
     return s4a.clean(as_dataset(u * axes, T)), field, u * axes
 
 
-def image_of(result, template):
-    moved = (template["position"] + result["displacement"] - result["translation"]).values
-    return moved @ result["rotation"].values / result["scale"].item()
-
-
 def error(result, template, true):
-    return np.linalg.norm(image_of(result, template) - true, axis=1).mean()
+    image = image_in_shape(template["position"].values, result)
+    return np.linalg.norm(image - true, axis=1).mean()
 
 
 def test_a_field_tells_what_the_surface_does_not():

@@ -9,6 +9,7 @@ import xarray as xr
 from scipy.spatial import cKDTree
 
 from s4a import analyse, insert, synthetic, transfer_labels, transfer_landmarks
+from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.latent import frozen_basis
 from s4a.method.pca import gram_pca, project_scores
@@ -41,9 +42,7 @@ def errors(tree, study, shape):
     """Errors of the registered template on one shape, as shares of sqrt(area)."""
     data = study["registration"].to_dataset()
     u = tree["truth"][data.attrs["template"]]["reference_point"].values
-    one = data.sel(shape=shape)
-    X = data["position"].values + one["displacement"].values
-    image = (X - one["translation"].values) @ one["rotation"].values / one["scale"].item()
+    image = image_in_shape(data["position"].values, data.sel(shape=shape))
     size = np.sqrt(vertex_areas(*as_arrays(data)).sum())
     return np.linalg.norm(image - synthetic.position(tree["truth"], shape, u), axis=1) / size
 

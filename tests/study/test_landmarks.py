@@ -22,6 +22,7 @@ from s4a import (
     with_landmarks,
     write_mesh,
 )
+from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.closest import interpolate
 from s4a.geometry.mesh import as_arrays
 from s4a.input.annotations import write_landmarks
@@ -37,12 +38,6 @@ from s4a.schema import dataset
 def points(positions, names="abcdefghij"):
     """Landmarks of these positions and one letter each."""
     return dataset(landmark_name=list(names[: len(positions)]), landmark_position=positions)
-
-
-def image(result, template):
-    """The registered template, in the unit of the source."""
-    moved = (template["position"] + result["displacement"] - result["translation"]).values
-    return moved @ result["rotation"].values / result["scale"].item()
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +70,8 @@ def test_a_landmark_that_contradicts_the_surfaces_pulls_the_registration_where_i
         result = match_pair(pair[1], pair[0], **options)
         marked = with_landmarks(template, points(on_template))
         point = marked["guide_triangle"].values, marked["guide_barycentric"].values
-        at = interpolate(image(result, template), as_arrays(template)[1], *point)
+        image = image_in_shape(template["position"].values, result)
+        at = interpolate(image, as_arrays(template)[1], *point)
         distances[what] = np.linalg.norm(at - moved, axis=1), np.linalg.norm(at - on_shape, axis=1)
     assert distances["moved"][0][2] < 0.75 * distances["none"][0][2]  # drawn to where it was put
     others = [0, 1, 3, 4]
