@@ -346,7 +346,8 @@ def test_landmark_files_of_other_programs_are_read(tmp_path, caplog):
     assert read_landmarks(tmp_path / "a.csv.gz")["landmark_position"].values == pytest.approx(P)
     left_out = [record.getMessage().rpartition(": ")[::2] for record in caplog.records]
     assert [(Path(text.partition(":")[0]).name, names) for text, names in left_out] == [
-        ("five.fcsv", "c, c, c"), ("set.json", "1, 3"), ("a.pp", "c"), ("lps.csv", "c")]  # fmt: skip
+        ("five.fcsv", "c, c, c"), ("set.json", "1, 3"), ("a.pp", "c"), ("lps.csv", "c"),
+    ]  # fmt: skip
     wrong = {
         "two.tps": "one specimen needed, found x, y: choose one as FILE.tps:x",
         "a.tps": "2 points needed, found 1",
