@@ -35,9 +35,11 @@ def small_pictures(patch, figures=(72, 60), pages=None):
 def small_searches(patch):
     """Let partial shapes be matched by fewer points, and shapes be compared with fewer others."""
     from s4a.input import plausibility
-    from s4a_morphometrics import part
+    from s4a_morphometrics import completion, part
 
     patch(plausibility.pick_references, "__defaults__", (2,))
+    patch(part.distinct, "__defaults__", (5,))
+    patch(completion, "N_AGAIN", 12)
     for name, value in {"N_POINTS": 300, "N_ANCHORS": 3, "N_ROUGH": 80}.items():
         patch(part, name, value)
 

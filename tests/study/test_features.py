@@ -77,7 +77,7 @@ def test_a_field_that_does_not_fit_is_refused(given, text):
 def files(tmp_path_factory):
     """Four brains as files, three of them with a file of a field."""
     folder = tmp_path_factory.mktemp("files")
-    tree = s4a.synthetic.brains(4, 1500, seed=1)
+    tree = s4a.synthetic.brains(4, 700, seed=1)
     for path in s4a.synthetic.write(tree, folder)[:3]:
         mesh = s4a.read_mesh(path)
         np.save(folder / f"{path.stem}.height.npy", mesh[0][:, 2])

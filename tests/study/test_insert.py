@@ -14,12 +14,12 @@ from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a.method.latent import frozen_basis
 from s4a.method.pca import gram_pca, project_scores
 
-OPTIONS = {"n_coarse": 500, "k": 30, "n_jobs": 1}
+OPTIONS = {"n_coarse": 350, "k": 30, "n_jobs": 1}
 
 
 @pytest.fixture(scope="module")
 def tree():
-    return synthetic.brains(6, 2000, seed=5, n_modes=2)
+    return synthetic.brains(6, 1200, seed=5, n_modes=2)
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +112,7 @@ def test_labels_travel_from_the_template_and_from_an_external_mesh_to_new_shapes
     }
     assert right["brain_06"] > 0.85
     assert right["brain_06"] > min(right.values()) - 0.05
-    other = synthetic.brains(1, 4000, seed=9)["original/brain_01"].to_dataset()
+    other = synthetic.brains(1, 2500, seed=9)["original/brain_01"].to_dataset()
     outside = transfer_labels(study, other["label"].values, source=other)
     assert set(outside.children) == set(study["registration"]["shape"].values)
     for name, node in outside.children.items():

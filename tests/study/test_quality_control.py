@@ -20,7 +20,7 @@ FLAGGED = ["a_metre", "z_inch"]
 @pytest.fixture(scope="module")
 def good():
     """Five brains as points and triangles."""
-    tree = synthetic.brains(5, 600, seed=2)["original"]
+    tree = synthetic.brains(5, 400, seed=2)["original"]
     return {name: as_arrays(node.to_dataset()) for name, node in tree.children.items()}
 
 
