@@ -32,6 +32,15 @@ def small_pictures(patch, figures=(72, 60), pages=None):
         patch(module, "render", lambda *a, few=few, **o: draw.render(*a, **o | {"size": few}))
 
 
+def small_charts(patch):
+    """Let charts be rendered with few pixels."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    whole = FigureCanvasBase.print_figure
+    few = lambda *what, dpi=None, **options: whole(*what, dpi=24, **options)  # noqa: E731
+    patch(FigureCanvasBase, "print_figure", few)
+
+
 def small_searches(patch):
     """Let partial shapes be matched by fewer points, and shapes be compared with fewer others."""
     from s4a.input import plausibility
@@ -75,6 +84,7 @@ def launch(argv):
     from ipykernel.kernelapp import launch_new_instance
 
     small_pictures(setattr, pages=(40, 32))
+    small_charts(setattr)
     small_searches(setattr)
     small_brains(setattr, 6, 1000)
     small_analyses(setattr, 200)
