@@ -32,12 +32,23 @@ def small_pictures(patch, figures=(72, 60), pages=None):
         patch(module, "render", lambda *a, few=few, **o: draw.render(*a, **o | {"size": few}))
 
 
+def small_charts(patch):
+    """Let charts be rendered with few pixels."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    whole = FigureCanvasBase.print_figure
+    few = lambda *what, dpi=None, **options: whole(*what, dpi=24, **options)  # noqa: E731
+    patch(FigureCanvasBase, "print_figure", few)
+
+
 def small_searches(patch):
     """Let partial shapes be matched by fewer points, and shapes be compared with fewer others."""
     from s4a.input import plausibility
-    from s4a_morphometrics import part
+    from s4a_morphometrics import completion, part
 
     patch(plausibility.pick_references, "__defaults__", (2,))
+    patch(part.distinct, "__defaults__", (5,))
+    patch(completion, "N_AGAIN", 12)
     for name, value in {"N_POINTS": 300, "N_ANCHORS": 3, "N_ROUGH": 80}.items():
         patch(part, name, value)
 
@@ -73,6 +84,7 @@ def launch(argv):
     from ipykernel.kernelapp import launch_new_instance
 
     small_pictures(setattr, pages=(40, 32))
+    small_charts(setattr)
     small_searches(setattr)
     small_brains(setattr, 6, 1000)
     small_analyses(setattr, 200)

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from small import small_searches
 
 from s4a import analyse, cli, insert, synthetic, with_landmarks, write_mesh
+from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
 from s4a_morphometrics import calibration, complete, posterior
 from s4a_morphometrics.calibration import between_paths, deviation_of, path_differences
@@ -122,9 +123,7 @@ def test_new_shapes_are_predicted_as_well_as_left_out_shapes():
 
 def test_intervals_of_ninety_percent_cover_the_complete_shape(study, brain, found):
     whole = insert(study, {"brain_08": brain}, compare=False)["registration"].to_dataset()
-    whole = whole.isel(shape=0)
-    image = whole["position"].values + whole["displacement"].values - whole["translation"].values
-    image = image @ whole["rotation"].values @ TURN.T + [5.0, 0, 0]
+    image = image_in_shape(whole["position"].values, whole.isel(shape=0)) @ TURN.T + [5.0, 0, 0]
     # both are matches over the template: what two ways of matching differ by is in neither
     sd = np.sqrt(found["completion_sd"].values ** 2 - found.attrs["added"] ** 2)
     ratio = abs(found["position"].values - image) / sd
@@ -198,8 +197,7 @@ def test_the_missing_region_is_detected_and_the_present_one_as_accurate_as_of_th
     error = np.linalg.norm((found["position"].values - [5.0, 0, 0]) @ TURN - true, axis=1)
     whole = insert(study, {"brain_08": brain}, compare=False)["registration"].to_dataset()
     whole = whole.isel(shape=0)
-    image = whole["position"].values + whole["displacement"].values - whole["translation"].values
-    of_whole = np.linalg.norm(image @ whole["rotation"].values - true, axis=1)
+    of_whole = np.linalg.norm(image_in_shape(whole["position"].values, whole) - true, axis=1)
     assert error[there].mean() < 1.5 * of_whole[there].mean()
     mean = study["pca"]["mean_displacement"].values + study["registration"]["position"].values
     away = np.linalg.norm(mean @ whole["rotation"].values - true, axis=1)

@@ -8,7 +8,7 @@ from s4a.geometry.mesh import as_arrays
 from s4a_morphometrics import generalization
 from s4a_morphometrics.leave_one_out import without
 
-OPTIONS = {"n_coarse": 300, "k_init": 8, "k": 12, "n_jobs": 1}
+OPTIONS = {"n_coarse": 200, "k_init": 8, "k": 12, "n_jobs": 1}
 NAMES = [f"brain_{i:02d}" for i in range(1, 7)]
 
 
@@ -16,7 +16,7 @@ NAMES = [f"brain_{i:02d}" for i in range(1, 7)]
 def folder(tmp_path_factory):
     """The folder of a study of six brains."""
     folder = tmp_path_factory.mktemp("left_out") / "study"
-    brains = synthetic.brains(7, 700, seed=3)["original"]
+    brains = synthetic.brains(7, 400, seed=3)["original"]
     analyse({n: brains[n].to_dataset() for n in NAMES}, store=folder, **OPTIONS).close()
     return folder
 
@@ -59,7 +59,7 @@ def test_without_its_template_a_study_is_registered_to_the_next(study):
 
 
 def test_flagged_shapes_are_left_out_or_included_on_demand():
-    tree, small = synthetic.brains(5, 300, seed=2)["original"], OPTIONS | {"n_coarse": 150}
+    tree, small = synthetic.brains(5, 200, seed=2)["original"], OPTIONS | {"n_coarse": 120}
     good = {name: as_arrays(node.to_dataset()) for name, node in tree.children.items()}
     X, T = good["brain_01"]
     study = analyse(good | {"a_metre": (X / 1000, T)}, **small)

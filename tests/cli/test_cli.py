@@ -273,10 +273,12 @@ def test_flags_and_their_help_follow_from_a_function():
     assert given["--minus"]["action"] == "store_true"
 
 
-def test_demo_finds_the_simulated_modes_and_writes_its_page(tmp_path, monkeypatch, capsys):
+def test_demo_finds_the_simulated_modes_and_writes_its_page(
+    tmp_path, monkeypatch, capsys, no_pictures
+):
     monkeypatch.setattr("s4a.write_page", lambda tree, file, **_: file.write_text("page"))
     out = tmp_path / "demo"
-    small = "--shapes 4 --vertices 700 --n-jobs 1".split()
+    small = "--shapes 4 --vertices 300 --n-jobs 1".split()
     assert cli.main(["demo", "--out", str(out), *small]) == 0
     said = capsys.readouterr().out
     assert "correlation of simulated and recovered scores" in said

@@ -1,4 +1,3 @@
-from collections import defaultdict
 from itertools import pairwise
 
 import numpy as np
@@ -6,34 +5,13 @@ import pytest
 import xarray as xr
 from paths import DATA
 from scipy.spatial import ConvexHull
+from surfaces import assert_oriented_manifold
 
 from s4a import synthetic
 from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, volume
 from s4a.input.clean import clean, clean_arrays
 from s4a.input.collection import read_shape, read_shapes
 from s4a.input.files import write_mesh
-
-
-def assert_oriented_manifold(X, T):
-    """Every directed edge once, and one fan of triangles around every vertex.
-
-    In plain Python, on its own.
-    """
-    after, directed = defaultdict(dict), set()
-    for a, b, c in T.tolist():
-        assert len({a, b, c}) == 3
-        for p, q, r in ((a, b, c), (b, c, a), (c, a, b)):
-            assert (p, q) not in directed
-            directed.add((p, q))
-            after[p][q] = r
-    assert len(after) == len(X), "a vertex without triangles"
-    for fan in after.values():
-        ends = set(fan) - set(fan.values())
-        assert len(ends) <= 1, "several fans"
-        at, calls = next(iter(ends or fan)), 0
-        while at in fan and calls < len(fan):
-            at, calls = fan[at], calls + 1
-        assert calls == len(fan), "several closed fans"
 
 
 def cleaned(X, T, **options):
@@ -56,12 +34,8 @@ def sphere(n=200, seed=0):
     return X, np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
 
 
-def torus(n=12, m=8):
-    i, j = (a.ravel() for a in np.meshgrid(np.arange(n), np.arange(m), indexing="ij"))
-    u, v = 2 * np.pi * i / n, 2 * np.pi * j / m
-    X = np.stack([(3 + np.cos(v)) * np.cos(u), (3 + np.cos(v)) * np.sin(u), np.sin(v)], axis=1)
-    a, b, c, d = (((i + p) % n) * m + (j + q) % m for p, q in ((0, 0), (1, 0), (1, 1), (0, 1)))
-    return X, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+def torus():
+    return as_arrays(synthetic.torus(12, 8))
 
 
 def cube(corner):
@@ -263,13 +237,8 @@ def test_solids_that_touch_in_an_edge_or_a_vertex_are_separated():
 
 
 def test_a_surface_that_touches_itself_in_an_edge_stays_closed():
-    ring = [
-        [0, 0, 0],
-        [1, 1, 0],
-        [1, 1, 1],
-        [0, 1, 1],
-        [0, 0, 1],
-    ]  # the first two cubes touch in an edge
+    # the first two cubes touch in an edge
+    ring = [[0, 0, 0], [1, 1, 0], [1, 1, 1], [0, 1, 1], [0, 0, 1]]
     X, T = together(*[cube(corner) for corner in ring])
     _, _, counts = cleaned(X, T)
     assert counts["nonmanifold_edges"] > 0
@@ -311,27 +280,15 @@ def test_an_open_shape_faces_outwards_too():
 def test_a_moebius_strip_is_cut_into_one_that_has_two_sides():
     n = 20
     u = 2 * np.pi * np.arange(n) / n
-    boundary = [
-        np.stack(
-            [
-                (3 + s * np.cos(u / 2)) * np.cos(u),
-                (3 + s * np.cos(u / 2)) * np.sin(u),
-                s * np.sin(u / 2),
-            ],
-            1,
-        )
-        for s in (-1, 1)
-    ]
+    s = np.repeat([-1, 1], n)  # the two sides of the strip
+    r, u = 3 + s * np.cos(np.tile(u, 2) / 2), np.tile(u, 2)
+    boundary = np.stack([r * np.cos(u), r * np.sin(u), s * np.sin(u / 2)], axis=1)
     a, b = np.arange(n), n + np.arange(n)
     c, d = np.r_[a[1:], b[0]], np.r_[b[1:], a[0]]
     T = np.concatenate([np.stack([a, c, d], axis=1), np.stack([a, d, b], axis=1)])
-    _, S, counts = cleaned(np.concatenate(boundary), T)
-    assert (len(S), counts["components"], counts["holes"], counts["euler_characteristic"]) == (
-        2 * n,
-        1,
-        1,
-        1,
-    )
+    _, S, counts = cleaned(boundary, T)
+    assert len(S) == 2 * n
+    assert counts["components"] == counts["holes"] == counts["euler_characteristic"] == 1
 
 
 def test_an_edge_with_very_many_triangles_is_cut():

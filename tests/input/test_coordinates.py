@@ -1,5 +1,6 @@
 """Coordinate systems: read from every format, converted in one place, refused where unknown."""
 
+import gzip
 import zlib
 from base64 import b64encode
 from pathlib import Path
@@ -17,7 +18,6 @@ from s4a.input.chirality import in_file
 from s4a.input.coordinates import CoordinateSystem, common, in_one_system, transform
 from s4a.input.formats import vtk_bytes, vtp_bytes
 from s4a.input.landmarks import locate
-from s4a.input.raw import sentences
 from s4a.schema import dataset, in_unit
 from s4a.study.pair import pair_study
 
@@ -275,6 +275,8 @@ def test_landmarks_lie_on_the_surface_whatever_the_two_files_say(tmp_path):
     ]
     for points, mesh in cases:
         assert locate(points, mesh)["landmark_distance"].values == pytest.approx(0, abs=1e-4)
+    with pytest.raises(ValueError, match="RAS, LPS"):
+        locate(marks("RAS", X * [-1, -1, 1]), as_dataset(X, T, system("RAS").attrs), farthest=1e-3)
 
 
 HEAD = "# Markups fiducial file version = 4.11\n"
@@ -316,6 +318,10 @@ def test_landmark_files_of_other_programs_are_read(tmp_path, caplog):
                 ("preview", [0] * 3), ("defined", P[0].tolist()),
                 ("missing", [0] * 3), ("defined", P[1].tolist())))), "LPS", ["2", "4"]),
         "index.csv": (",x,y,z\na,1.5,2,3\nb,-4,5.25,6\n", "", names),
+        "plain.csv": ("a 1.5 2 3\nb -4 5.25 6\n", "", names),
+        "a.pp": ('<!DOCTYPE PickedPoints><PickedPoints><point x="1.5" y="2" z="3" name="a"/>'
+                 '<point name="b" x="-4" y="5.25" z="6" active="1"/>'
+                 '<point x="0" y="0" z="0" name="c" active="0"/></PickedPoints>', "", names),
         "unit.csv": ("name,x,y,z,unit,coordinate_system\na,1.5,2,3,mm,LPS\nb,-4,5.25,6,,\n",
                      "LPS", names),
         "old.fcsv": (f"{HEAD}# CoordinateSystem = 0\n{COLUMNS}{fcsv}", "RAS", names),
@@ -336,9 +342,12 @@ def test_landmark_files_of_other_programs_are_read(tmp_path, caplog):
         assert found["landmark_position"].values == pytest.approx(P), name
         assert found["landmark_name"].values.tolist() == expected, name
         assert found.attrs == (system(axes).attrs if axes else {}), name
+    (tmp_path / "a.csv.gz").write_bytes(gzip.compress((tmp_path / "index.csv").read_bytes()))
+    assert read_landmarks(tmp_path / "a.csv.gz")["landmark_position"].values == pytest.approx(P)
     left_out = [record.getMessage().rpartition(": ")[::2] for record in caplog.records]
     assert [(Path(text.partition(":")[0]).name, names) for text, names in left_out] == [
-        ("five.fcsv", "c, c, c"), ("set.json", "1, 3"), ("lps.csv", "c")]  # fmt: skip
+        ("five.fcsv", "c, c, c"), ("set.json", "1, 3"), ("a.pp", "c"), ("lps.csv", "c"),
+    ]  # fmt: skip
     wrong = {
         "two.tps": "one specimen needed, found x, y: choose one as FILE.tps:x",
         "a.tps": "2 points needed, found 1",
@@ -401,12 +410,6 @@ def test_written_markups_lie_where_the_scan_has_them(tmp_path):
         assert found.attrs == system("RAS").attrs
         assert found["landmark_position"].values == pytest.approx(X[:3])
         assert np.linalg.det(M[:3, :3]) == pytest.approx(factor**3)
-
-
-def test_messages_end_at_the_end_of_a_sentence():
-    text = "3 of 6 shapes were converted to RAS (a; b), and the others were not; c. And so on."
-    ends = {sentences(text, n) for n in range(1, 100)}
-    assert ends == {text[: text.index(";", 60)], text[: text.index(" And")], text}
 
 
 def test_the_command_prints_the_system_of_each_file(tmp_path, capsys):

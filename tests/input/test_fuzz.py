@@ -22,12 +22,6 @@ def test_whole_files_are_read(tmp_path):
             assert fuzz.read(path, kind) == "parsed", name
 
 
-def test_a_damaged_file_is_the_same_every_time():
-    table = fuzz.seeds()
-    for name in table:
-        assert fuzz.damaged(0, name, 7, table) == fuzz.damaged(0, name, 7, fuzz.seeds())
-
-
 def test_damaged_files_are_read_or_refused_by_name_in_bounded_time_and_memory():
     names = list(fuzz.seeds())
     totals, failures = fuzz.fuzz(names, FILES, seed=3)

@@ -121,23 +121,10 @@ def test_self_intersections_are_reported_only_if_the_others_have_far_fewer(descr
 
 
 def test_a_registration_is_flagged_by_error_times_distortion_if_neither_alone_suffices():
-    registration_error = {
-        "template": 0.0,
-        "good": 0.03,
-        "far": 0.038,
-        "odd": 0.025,
-        "stretched": 0.01,
-        "fine": 0.02,
-    }
-    distortion = {
-        "template": 0.0,
-        "good": 0.1,
-        "far": 0.21,
-        "odd": 0.19,
-        "stretched": 0.3,
-        "fine": 0.1,
-    }
-    flags, _ = flagged(registration_error, distortion)
+    names = ["template", "good", "far", "odd", "stretched", "fine"]
+    error = dict(zip(names, [0.0, 0.03, 0.038, 0.025, 0.01, 0.02], strict=True))
+    distortion = dict(zip(names, [0.0, 0.1, 0.21, 0.19, 0.3, 0.1], strict=True))
+    flags, _ = flagged(error, distortion)
     assert {n: [flag.flagged for flag in flags[n]] for n in flags} == {
         "far": [True],
         "odd": [False],

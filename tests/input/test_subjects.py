@@ -12,7 +12,7 @@ from s4a.input.annotations import read_labels, read_landmarks
 from s4a.input.files import slugs
 from s4a.input.subjects import read_table, subjects, with_table
 
-OPTIONS = {"n_coarse": 300, "k_init": 8, "k": 12, "n_jobs": 1}
+OPTIONS = {"n_coarse": 150, "k_init": 8, "k": 12, "n_jobs": 1}
 NAMES = [f"brain_{i:02d}" for i in range(1, 8)]
 TABLE = "shape;sex;age;score\n" + "".join(
     f"{n};{'fm'[i % 2]};{20 + 7 * i};{i / 2}\n" for i, n in enumerate(NAMES)
@@ -22,7 +22,7 @@ TABLE = "shape;sex;age;score\n" + "".join(
 @pytest.fixture(scope="module")
 def brains():
     return {
-        n: m.to_dataset() for n, m in synthetic.brains(7, 700, seed=3)["original"].children.items()
+        n: m.to_dataset() for n, m in synthetic.brains(7, 300, seed=3)["original"].children.items()
     }
 
 
@@ -283,7 +283,7 @@ def test_the_command_inserts_shapes(folder, brains, tmp_path, capsys):
     ):
         alone = insert(study, tmp_path / "brain_07.ply")
         np.testing.assert_array_equal(tree["pca"]["score"], alone["pca"]["score"])
-        assert tree["registration/brain_07"]["template_triangle"].sizes == {"original_vertex": 700}
+        assert tree["registration/brain_07"]["template_triangle"].sizes == {"original_vertex": 300}
     scores = (tmp_path / "out" / "scores.csv").read_text().splitlines()
     assert scores[1].split(",")[0] == "brain_07"
     assert (tmp_path / "out" / "brain_07.ply").is_file()

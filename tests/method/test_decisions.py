@@ -154,9 +154,11 @@ def test_no_further_step_is_made_where_a_step_lets_the_bending_energy_grow(surfa
 # ---- the size of the latent basis
 
 
-@pytest.mark.parametrize("k, expected", [(20, 5), (21, 5), (23, 6), (30, 8), (2, 1), (100, 25)])
-def test_the_latent_size_is_the_nearest_whole_number_to_its_share(k, expected):
-    assert latent.latent_size(25, k, 100) == expected  # 5.25 is 5, 5.75 is 6, 7.5 is 8
+def test_the_latent_size_is_the_nearest_whole_number_to_its_share_of_maps_of_any_size():
+    sizes = {20: 5, 21: 5, 23: 6, 30: 8, 2: 1, 100: 25}  # 5.25 is 5, 5.75 is 6, 7.5 is 8
+    assert {k: latent.latent_size(25, k, 100) for k in sizes} == sizes
+    assert [latent.latent_size(n, 20, 100) for n in (None, 100, 50, 1)] == [20, 20, 10, 1]
+    assert [latent.latent_size(50, k, 12) for k in (6, 12)] == [6, 12], "of maps that are reduced"
 
 
 def test_initialisations_that_end_within_a_hundredth_are_merged_into_their_mean(

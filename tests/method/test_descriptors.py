@@ -179,55 +179,6 @@ def test_the_fit_is_what_a_slow_optimiser_finds(sizes, with_operators):
     assert energy(C, F, G, **terms) <= slow.fun * (1 + 1e-12)
 
 
-def test_without_weight_operators_change_nothing():
-    F, G, terms = problem(np.random.default_rng(2), 5, 5)
-    F, G = (np.column_stack([M, np.random.default_rng(3).normal(size=(5, 3))]) for M in (F, G))
-    row_by_row = fmap.fit(F, G, penalty=terms["penalty"])
-    _, P, Q = terms["operators"][0]
-    assert fmap.fit(F, G, penalty=terms["penalty"], operators=[(0.0, P, Q)]) == pytest.approx(
-        row_by_row
-    )
-
-
-@pytest.mark.parametrize("oriented", [0.0, 0.5])
-def test_the_fit_is_where_that_of_pyfm_ends(brains, oriented):
-    functional = pytest.importorskip("pyFM.functional")
-    weights = pytest.importorskip("pyFM.optimize.weights")
-    pyfm = pytest.importorskip("pyFM.mesh")
-    k = 8
-    peer = functional.FunctionalMapping(
-        *(
-            pyfm.TriMesh(
-                m["position"].values / np.sqrt(m["vertex_area"].values.sum()), as_arrays(m)[1]
-            )
-            for m in brains
-        )
-    )
-    peer.preprocess(n_descr=20, subsample_step=5, k_process=30, k_descr=30)
-    ratio = np.array([1e-1, 1e-3, 1.0, oriented])
-    peer.fit(K=(k, k), w_orient=oriented, factr=10, pgtol=1e-12)
-
-    ends = []
-    for mesh, f in ((peer.mesh1, peer.descr1), (peer.mesh2, peer.descr2)):
-        Phi, area = mesh.eigenvectors[:, :k], mesh.A.diagonal()
-        operator = fmap.orientation(mesh.faces, Phi, f)
-        ends.append((Phi.T @ (area[:, None] * f), fmap.multiplication(Phi, area, f), operator))
-    (F, P, W), (G, Q, V) = ends
-    mask = weights.resolvent_mask(peer.mesh1.eigenvalues[:k], peer.mesh2.eigenvalues[:k])
-    tau = weights.canonical_taus(F, G, (P, Q), (W, V) if oriented else [], mask)
-    w = ratio / ratio.sum() / tau
-    operators = [(w[2], P, Q)] + ([(w[3], W, V)] if oriented else [])
-    start = peer._get_x0("zeros")[0, 0]
-    ours = fmap.fit(
-        np.sqrt(w[0]) * F,
-        np.sqrt(w[0]) * G,
-        penalty=w[1] * mask,
-        operators=operators,
-        constant=start,
-    )
-    assert ours == pytest.approx(peer.FM_12, abs=1e-4)
-
-
 def test_the_fit_to_wave_kernels_is_that_of_pyfm(brains):
     functional, pyfm = map(pytest.importorskip, ("pyFM.functional", "pyFM.mesh"))
     source, target = map(low, brains)

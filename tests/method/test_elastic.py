@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from s4a import analyse, match_pair, synthetic
+from s4a import match_pair, synthetic
+from s4a.analysis.transfer import image_in_shape
 from s4a.geometry.closest import distance_to_surface
 from s4a.geometry.mesh import (
     as_arrays,
@@ -72,13 +73,6 @@ def test_they_are_more_accurate_than_spectral_icp(pair, ends):
     by_joint = error(spectral_icp.move(template.full, warp), true_image)
     by_elastic = error(spectral_icp.move(template.full, ends[0]), true_image)
     assert by_elastic < 0.5 * by_joint
-
-
-def test_two_initialisations_converge_to_one_registration(pair, ends):
-    template, shape, _ = pair
-    begin = [spectral_icp.move(template.full, warp) for warp in initial_warps(template, shape)]
-    end = [spectral_icp.move(template.full, warp) for warp in ends]
-    assert error(*end) < 0.05 * error(*begin)
 
 
 def test_no_triangle_is_flipped(pair, ends):
@@ -245,8 +239,7 @@ def test_less_stiff_iterations_are_more_accurate_for_a_strained_template(monkeyp
 
     def registered():
         found = match_pair(shape, template, n_coarse=600, k=50)
-        image = template["position"] + found["displacement"] - found["translation"]
-        image = image.values @ found["rotation"].values / found["scale"].item()
+        image = image_in_shape(template["position"].values, found)
         torn = np.quantile(abs(found["distortion"]), 0.99)
         return found.attrs["initialisation"], torn, np.linalg.norm(image - true, axis=1).mean()
 
@@ -295,17 +288,6 @@ def test_the_stiffness_is_computed_again_where_a_study_was_made_smaller(pair):
     template, _, _ = pair
     smaller = replace(template, coarse=template.coarse.drop_vars(["edge_vertex", "cotan_weight"]))
     assert (smaller.W != template.W).nnz == 0
-
-
-def test_a_study_and_a_pair_take_it_and_say_so(brains):
-    names = ("brain_01", "brain_02")
-    meshes = {name: brains["original"][name].to_dataset() for name in names}
-    small = {"n_coarse": 400, "k": 20, "k_init": 8}
-    found = match_pair(meshes["brain_02"], meshes["brain_01"], refine="elastic", **small)
-    assert np.isfinite(found["displacement"]).all()
-    with analyse(meshes, n_jobs=1, **small) as study:
-        assert Options.from_report(study).refine == "elastic"
-        assert (study["registration"]["confidence"] > 0).any()
 
 
 def bowl(n_vertices, height=0.0):

@@ -39,13 +39,6 @@ def basis(Phi, area, eigenvalue=None):
     return Basis(None, None, area, Phi, eigenvalue)
 
 
-def test_identical_shapes_give_identity_maps(shape):
-    Phi, area, _, X = shape
-    C = fmap.fmap_from_match(Phi, Phi, area, np.arange(len(X)))
-    assert pytest.approx(np.eye(40), abs=1e-9) == C
-    assert (fmap.match_from_fmap(C, Phi, Phi) == np.arange(len(X))).all()
-
-
 def test_the_map_of_a_permutation_is_orthogonal_and_carries_functions(shape, permuted):
     Phi, area, _, _ = shape
     Psi, area_target, _, _, order, sign = permuted
@@ -101,14 +94,6 @@ def test_a_map_between_different_sizes_has_the_dims_target_by_source(shape):
     assert fmap.match_from_fmap(C, Phi, Phi).shape == (len(X),)
 
 
-def test_the_landmark_fit_of_identical_shapes_is_near_the_identity(shape):
-    Phi, area, eigenvalue, X = shape
-    landmark = farthest_points(X, 10)
-    same = basis(Phi, area, eigenvalue).truncated(20)
-    C = fmap.fmap_from_landmarks(same, same, landmark, landmark)
-    assert pytest.approx(np.eye(20), abs=1e-6) == C
-
-
 def test_the_landmark_fit_finds_the_signs_of_the_eigenfunctions(shape, permuted):
     Phi, area, eigenvalue, X = shape
     Psi, area_target, _, _, order, sign = permuted
@@ -153,12 +138,6 @@ def test_rows_within_float32_rounding_are_distinguished():
     Q = D[rng.permutation(600)]
     assert (D.astype(np.float32)[::2] == D.astype(np.float32)[1::2]).mean() > 0.9
     assert (D[nearest_rows(Q, D)] == Q).all()
-
-
-def test_nearest_rows_does_not_depend_on_the_block():
-    rng = np.random.default_rng(5)
-    Q, D = rng.normal(size=(1000, 20)), rng.normal(size=(900, 20))
-    assert (nearest_rows(Q, D, block=64) == nearest_rows(Q, D)).all()
 
 
 def test_of_equal_rows_the_first_is_given():

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from s4a import analyse, insert, match_pair, synthetic
@@ -107,12 +106,6 @@ def test_shapes_in_one_pose_keep_their_initial_map(monkeypatch):
 
     monkeypatch.setattr(initial_map, "best_initial_maps", refuse)
     assert match_pair(source, target, n_coarse=600, k=40).attrs["initial_map"] == "dense"
-
-
-def test_poses_differ_only_if_no_rigid_transform_aligns_the_shapes(shapes):
-    M, N = (s.low for s in shapes)
-    assert not spectral_icp.poses_differ(M, M, np.arange(len(M.X)))
-    assert spectral_icp.poses_differ(M, N, cKDTree(M.X).query(N.X)[1])
 
 
 def test_of_initial_maps_the_best_is_chosen(shapes):

@@ -118,14 +118,6 @@ def test_an_unconnected_network_is_refused(maps, eigenvalues):
         latent.latent_basis(C[keep], source[keep], target[keep], weight[keep], eigenvalues)
 
 
-def test_the_latent_size_grows_with_the_maps():
-    assert [latent.latent_size(n, 20, 100) for n in (None, 100, 50, 1)] == [20, 20, 10, 1]
-
-
-def test_the_latent_size_is_no_larger_than_maps_that_had_to_be_reduced():
-    assert [latent.latent_size(50, size, 12) for size in (6, 12)] == [6, 12]
-
-
 @pytest.fixture(scope="module")
 def shapes():
     tree = synthetic.brains(3, 3000)["original"]

@@ -11,7 +11,6 @@ from s4a.geometry.mesh import as_arrays
 from s4a.method.nearest import (
     as_candidates,
     as_queries,
-    into_cells,
     nearest_around,
     nearest_bidirectional,
     nearest_float32,
@@ -123,16 +122,6 @@ def test_of_equal_rows_one_is_given():
     (D, cell), rng = clustered(200, 8, 10), np.random.default_rng(1)
     found = nearest_in_cells(D, cell, np.concatenate([D, D]), rng.integers(0, 9, 400))[0]
     assert (found % 200 == np.arange(200)).all()
-
-
-def test_cells_hold_all_rows_within_their_radius():
-    (D, cell) = clustered(500, 6, 11)
-    cells = into_cells(D, cell)
-    assert (np.sort(cells.order) == np.arange(500)).all()
-    assert cells.rows == pytest.approx(D[cells.order], abs=1e-6)
-    for c, (begin, end) in enumerate(zip(cells.start[:-1], cells.start[1:], strict=True)):
-        distance = np.linalg.norm(cells.rows[begin:end] - cells.center[c], axis=1)
-        assert distance.max() <= cells.radius[c] * (1 + 1e-5)
 
 
 @pytest.mark.parametrize("d", [1, 6, 50])

@@ -39,12 +39,6 @@ def test_the_smallest_budget_gives_the_minimum_spanning_tree():
     assert network.choose_pairs(np.abs(x - x.T), 4).tolist() == [[0, 1], [1, 2], [2, 3], [3, 4]]
 
 
-def test_all_pairs_are_given_where_the_budget_allows():
-    assert network.choose_pairs(distances(6), 500).tolist() == [
-        list(p) for p in itertools.combinations(range(6), 2)
-    ]
-
-
 @pytest.mark.parametrize("n", [3, 6, 15])
 def test_every_shape_is_in_a_triangle_with_twice_as_many_pairs_as_shapes(n):
     for seed in range(5):
@@ -95,10 +89,6 @@ def test_pairs_are_those_of_the_definition(kind, seed):
     for n_pairs in {n - 1, 2 * n, 4 * n}:
         found = network.choose_pairs(distance, n_pairs).tolist()
         assert [tuple(pair) for pair in found] == chosen_by_definition(distance, n_pairs)
-
-
-def test_equal_shapes_can_be_paired():
-    assert is_connected(network.choose_pairs(np.zeros((5, 5)), 6), 5)
 
 
 @pytest.mark.parametrize("budget", [0, 3, -1, 4.5])

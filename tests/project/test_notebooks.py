@@ -39,9 +39,9 @@ json.dumps({"seconds": seconds, "MiB": (own.ru_maxrss + child.ru_maxrss) / unit}
 """
 FEWER = {  # what lessons compute of many, here of a few
     'for subject in "ABCDEF"': 'for subject in "ABCDE"',
-    "subjects(12, 500": "subjects(8, 300",
+    "subjects(12, 500": "subjects(8, 200",
     "np.arange(11) < 6": "np.arange(7) < 4",
-    "s4a.synthetic.sphere(900)": "s4a.synthetic.sphere(500)",
+    "s4a.synthetic.sphere(900)": "s4a.synthetic.sphere(300)",
     "(scans, n_coarse=300": "(scans, n_coarse=150",
     "n_permutations=999": "n_permutations=99",
 }

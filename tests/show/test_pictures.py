@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from PIL import Image
-from test_view import make_study, sphere
+from simulated import X, study_of
+from test_view import sphere
 
 import s4a
 from s4a.geometry.mesh import as_dataset
@@ -12,7 +13,10 @@ from s4a.show.surfaces import mode_limits
 
 @pytest.fixture(scope="module")
 def study():
-    return make_study()
+    """Ellipsoids that differ most in their height, by their scores, three of which are negative."""
+    score = np.array([[-1.0, 0.2, 0.1], [-0.6, -0.3, 0.1], [-0.4, 0.3, -0.2], [2.0, -0.2, 0.0]])
+    modes = X * np.array([[0, 0, 0.3], [0.05, 0, 0], [0, 0.03, 0]])[:, None]
+    return study_of(np.einsum("sc,cnx->snx", score, modes))
 
 
 def pixels(path):

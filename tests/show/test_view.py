@@ -9,14 +9,14 @@ import pytest
 import xarray as xr
 
 from s4a import synthetic
-from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas
+from s4a.geometry.mesh import as_arrays
 from s4a.schema import dataset
 from s4a.show import draw, page
 from s4a.show.charts import svg, variance
 from s4a.show.surfaces import mode_limits
 
 pytestmark = pytest.mark.usefixtures("no_pictures_in_module")
-K, N_SHAPES = 12, 6
+N_SHAPES = 6
 
 
 def sphere(n=366):
@@ -24,85 +24,22 @@ def sphere(n=366):
     return as_arrays(synthetic.sphere(n))
 
 
-def make_study(n=366):
-    """A study as the pipeline leaves it.
-
-    Of ellipsoids whose height is the only thing that varies much.
-    """
-    rng = np.random.default_rng(0)
-    X, T = sphere(n)
-    X = (
-        X
-        * [60, 80, 65]
-        * (1 + 0.06 * np.sin(4 * np.arctan2(X[:, 1:2], X[:, :1])) * (1 - X[:, 2:] ** 2))
-    )
-    names = [f"shape-{i}" for i in range(N_SHAPES)]
-    score = rng.standard_normal((N_SHAPES, 3))
-    modes = np.stack([X * [0, 0, 0.09], X * [0.05, 0, 0], X * [0, 0.03, 0] * (X[:, 1:2] > 0)])
-    displacement = np.einsum("sc,cvx->svx", score, modes)
-    registered = X + displacement
-    tree = {"original": xr.Dataset(), "coarse": xr.Dataset()}
-    owner = np.zeros(len(X), int)
-    owner[T] = np.arange(len(T))[:, None]  # some triangle of each vertex
-    for name, position in zip(names, registered, strict=True):
-        tree[f"original/{name}"] = as_dataset(position + 5, T)
-        tree[f"coarse/{name}"] = as_dataset(position + 5, T, eigenvalue=np.arange(K))
-        weights = (T[owner] == np.arange(len(X))[:, None]).astype(float)
-        tree[f"registration/{name}"] = dataset(
-            template_triangle=owner, template_barycentric=weights
-        )
-    source, target = np.array(
-        [(i, j) for i in range(N_SHAPES) for j in range(N_SHAPES) if (i - j) % 6 in (1, 2, 4, 5)]
-    ).T
-    fmap = np.eye(K) + 0.15 * rng.standard_normal((len(source), K, K))
-    error = rng.random(len(source))
-    tree["network"] = dataset(
-        source=np.array(names)[source],
-        target=np.array(names)[target],
-        fmap=fmap,
-        fmap_initial=fmap[:, :6, :6] + 0.2 * rng.standard_normal((len(source), 6, 6)),
-        weight=np.exp(-error),
-        cycle_error=0.3 * error,
-        cycle_error_initial=error,
-    )
-    named = {"shape": names}
-    tree["latent"] = dataset(
-        {"median": "shape-2"}, distance_to_limit=np.abs(score[:, 0]), area_score=score
-    ).assign_coords(named)
-    tree["registration"] = dataset(
-        {"template": "shape-2"},
-        position=X,
-        corner_vertex=T,
-        registered_match=np.tile(np.arange(len(X)), (N_SHAPES, 1)),
-        displacement=displacement,
-        rotation=np.tile(np.eye(3), (N_SHAPES, 1, 1)),
-        translation=np.full((N_SHAPES, 3), -5.0),
-        scale=np.ones(N_SHAPES),
-        confidence=np.clip(1 - np.abs(displacement).max(2) / 20, 0, 1),
-    ).assign_coords(named)
-    tree["pca"] = dataset(
-        mean_displacement=0 * X,
-        deformation=modes,
-        standard_deviation=np.sqrt((modes**2).sum(2) @ vertex_areas(X, T)),
-        score=score,
-        explained_variance_ratio=[0.7, 0.2, 0.1],
-        explained_variance_ratio_low=[0.6, 0.25, 0.15],
-    ).assign_coords(named)
-    tree["report"] = dataset(
-        {"n_coarse": 6000, "k": 100, "refine": "spectral_icp", "made_from": 7 * f"{'0' * 32} "},
-        status=["ok"] * 5 + ["repaired", "excluded"],
-        reason=[""] * 5
-        + ["3 duplicate triangles removed", "not a surface: <script>alert('&')</script>"],
-        path=[f"heads/shape-{i}.ply" for i in range(7)],
-        seconds=[1.5, 20.0, 3.25],
-        peak_memory=[300.0, 1200.0, 900.0],
-    ).assign_coords(shape=[*names, "broken <b>"], stage=["clean", "coarse", "network"])
-    return xr.DataTree.from_dict(tree)
-
-
 @pytest.fixture(scope="module")
-def study():
-    return make_study()
+def study(example_study):
+    """The study of examples, with a repaired shape and an excluded one; their texts are HTML."""
+    tree = example_study.copy()
+    report = tree["report"].to_dataset()
+    excluded = report.isel(shape=[0]).assign_coords(shape=["broken <b>"])
+    report = xr.concat([report, excluded], "shape", data_vars="minimal")
+    reasons = ["3 duplicate triangles removed", "not a surface: <script>alert('&')</script>"]
+    tree["report"] = xr.DataTree(
+        report.assign(
+            status=("shape", ["ok"] * 5 + ["repaired", "excluded"]),
+            reason=("shape", [""] * 5 + reasons),
+            peak_memory=("stage", np.full(report.sizes["stage"], 1200.0)),
+        )
+    )
+    return tree
 
 
 @pytest.fixture(scope="module")
@@ -223,7 +160,7 @@ def test_warnings_are_at_the_top_and_every_shape_links_to_its_picture(study):
     assert "left out" in top
     assert "broken &lt;b&gt;" in top
     pictures = dict(re.findall(r'<figure id="(shape-\d)".*?<figcaption>(.*?)</figcaption>', text))
-    for kind, name in (("mirrored", "shape-1"), ("size", "shape-3")):
+    for kind, name in (("mirrored", "brain_02"), ("size", "brain_04")):
         line = re.search(rf"<li class=.*?{kind}.*?</li>", top)[0]
         target = re.search(rf'<a href="#(.*?)">{name}</a>', line)[1]
         assert pictures[target].startswith(name)
@@ -238,17 +175,12 @@ def test_text_of_the_study_is_escaped(html):
     assert "&lt;script&gt;alert" in html
 
 
-def test_the_page_shows_the_results_of_the_study(html):
-    summary = "7 shapes, 1 repaired, 0 flagged, 1 excluded; median shape-2; template shape-2; "
-    summary += "the first 3 modes explain 100%"
-    for text in (
-        summary,
-        "shape-2, the median",
-        "n_coarse",
-        "1,200",
-        "mode 3, +3 σ, from behind",
-        "70.0% of the variance",
-    ):
+def test_the_page_shows_the_results_of_the_study(study, html):
+    median, template = study["latent"].attrs["median"], study["registration"].attrs["template"]
+    summary = f"7 shapes, 1 repaired, 0 flagged, 1 excluded; median {median}; template {template}; "
+    first = study["pca"]["explained_variance_ratio"].values[0]
+    texts = [f"{median}, the median", "1,200", "mode 3, +3 σ, from behind"]
+    for text in (summary, *texts, f"{100 * first:.1f}% of the variance"):
         assert text in html
 
 
@@ -261,7 +193,7 @@ def test_the_page_holds_the_modes_as_they_are(study, html):
     state = json.loads(re.search(r'id="modes-state">(.*?)</script>', html, re.DOTALL)[1])
     deformation = np.frombuffer(base64.b64decode(state["deformation"]["base64"]), "<f4")
     assert (deformation == study["pca"]["deformation"].values.ravel().astype(np.float32)).all()
-    assert state["ratio"] == [0.7, 0.2, 0.1]
+    assert state["ratio"] == pytest.approx(study["pca"]["explained_variance_ratio"].values)
     assert 'id="modes-fallback"' in html.replace("'", '"')
 
 

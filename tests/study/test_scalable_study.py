@@ -25,22 +25,8 @@ LOCAL = {"local_vertex", "local_sample", "local_weight", "sample_cell", "edge_ma
 def folder(brain_files, tmp_path_factory):
     """The folder of a study of four brains, from the command line."""
     out = tmp_path_factory.mktemp("scalable") / "study"
-    assert (
-        main(
-            [
-                "run",
-                *map(str, brain_files),
-                "--out",
-                str(out),
-                "--method",
-                "scalable",
-                "--template",
-                "brain_01",
-                *FLAGS,
-            ]
-        )
-        == 0
-    )
+    words = ["run", *map(str, brain_files), "--out", str(out), "--method", "scalable"]
+    assert main([*words, "--template", "brain_01", *FLAGS]) == 0
     return out
 
 

@@ -1,6 +1,7 @@
 """A study on disk: keys, complete files, one run at a time, round trips."""
 
 import os
+import shutil
 import subprocess
 import sys
 
@@ -9,8 +10,7 @@ import pytest
 import xarray as xr
 
 from s4a import open_study, synthetic
-from s4a.geometry.mesh import as_arrays
-from s4a.schema import HOLDS, POINTS_INTO, TABLE, dataset
+from s4a.schema import dataset
 from s4a.study import netcdf, store
 
 PARTS = ["content", 3, 2.5, None, True, [1, 2], {"a": 1}, np.arange(4), b"bytes"]
@@ -58,12 +58,6 @@ def test_a_foreign_file_is_not_done(file):
     ):
         file.write_bytes(content)
         assert not netcdf.is_done(file, "key")
-
-
-def test_writing_leaves_one_file_and_nothing_temporary(file):
-    store.write(synthetic.sphere(100), file, "again")
-    assert [f.name for f in file.parent.iterdir()] == ["shape.nc"]
-    assert netcdf.read(file).sizes["vertex"] == 100
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_temporary(file):
@@ -123,89 +117,28 @@ def test_what_is_not_a_study_is_refused(tmp_path):
             open_study(tmp_path / name)
 
 
-def zeros(kind, sizes, attrs=None, **own):
-    """A Dataset of all variables that a file of this kind needs."""
-    needed, texts, numbers, _ = (words.split() for words in HOLDS[kind])
-    values = {}
-    for name in needed:
-        if name not in ("shape", "stage"):
-            dims = [dim for dim in TABLE[name][0] if dim in sizes]
-            whole = name in POINTS_INTO
-            values[name] = np.zeros([sizes[dim] for dim in dims], int if whole else float)
-    words = dict.fromkeys(texts, "") | dict.fromkeys(numbers, 0.0)
-    return dataset(words | (attrs or {}), **values | own)
-
-
-def write_tree(folder, names, template):
-    """A small finished study written by hand."""
-    X, T = as_arrays(synthetic.sphere(50))
-    mesh = {"position": X, "corner_vertex": T}
-    sizes = {"vertex": 50, "original_vertex": 50, "corner": 3, "xyz": 3, "xyz_2": 3, "eigenpair": 2}
-    sizes |= {"edge": 144, "end": 2}
-    for name in names:
-        original = zeros("original", sizes, {"reason": name}, **mesh)
-        store.write(original, folder / "original" / f"{name}.nc", "o")
-        store.write(zeros("coarse/shape", sizes, **mesh), folder / "coarse" / f"{name}.nc", "c")
-    of_all = sizes | {"shape": len(names), "latent": 2, "latent_2": 2}
-    latent = zeros("latent", of_all, {"median": template}, latent_eigenvalue=[0.0, 1.0])
-    store.write(latent.assign_coords(shape=names), folder / "latent.nc")
-    store.write(
-        zeros("registration", sizes, {"template": template}, **mesh), folder / "registration.nc"
-    )
-    for i, name in enumerate(names):
-        data = zeros(
-            "registration/shape",
-            sizes,
-            {"initialisation": "icp", "score": 0.1 * i},
-            displacement=np.full((50, 3), i, np.float32),
-        )
-        store.write(data, folder / "registration" / f"{name}.nc")
-
-
-def test_a_study_with_a_damaged_file_is_not_opened_and_the_file_is_named(tmp_path):
-    write_tree(tmp_path, ["a", "b", "c"], "a")
-    for name in ("registration/c", "registration", "original/a"):  # the first that is read is named
-        path = tmp_path / f"{name}.nc"
-        path.write_bytes(path.read_bytes()[:-100])
-        with pytest.raises(OSError, match=f"{name}.nc cannot be read"):
-            open_study(tmp_path)
-
-
-def test_a_tree_survives_the_round_trip(tmp_path):
-    names = ["a", "b", "c"]
-    write_tree(tmp_path, names, "a")
-    tree = open_study(tmp_path)
-    assert list(tree["original"].children) == ["a", "b", "c"]
-    registration = tree["registration"].to_dataset()
-    assert registration["shape"].values.tolist() == names
-    assert registration["displacement"].dims == ("shape", "vertex", "xyz")
-    assert registration["displacement"].mean(("vertex", "xyz")).values.tolist() == [0, 1, 2]
-    assert registration["displacement"].attrs["units"] == "unit of the input"
-    assert registration["registration_error"].values == pytest.approx([0, 0.1, 0.2])
-    assert registration.attrs["template"] == "a"
-    assert tree["registration/c"].to_dataset(inherit=False)["template_triangle"].shape == (50,)
-    assert tree["original/b"].attrs["reason"] == "b"
+def test_a_tree_survives_the_round_trip(study, tmp_path):
     file = tmp_path / "tree.nc"
-    tree.to_netcdf(file, engine="h5netcdf")
+    study.to_netcdf(file, engine="h5netcdf")
     with xr.open_datatree(file, engine="h5netcdf") as again:
-        for node in tree.subtree:
-            assert (
-                again[node.path].to_dataset(inherit=False).identical(node.to_dataset(inherit=False))
-            ), node.path
-    tree.close()
+        for node in study.subtree:
+            expected = node.to_dataset(inherit=False)
+            assert again[node.path].to_dataset(inherit=False).identical(expected), node.path
 
 
-def test_an_unfinished_study_opens_with_what_is_there(tmp_path):
-    write_tree(tmp_path, ["a", "b"], "a")
-    (tmp_path / "registration" / "b.nc").unlink()
-    (tmp_path / "coarse" / "b.nc").unlink()
-    (tmp_path / "original" / ".c.nc.77.tmp").write_bytes(b"half")
-    tree = open_study(tmp_path)
-    assert tree["registration"]["shape"].values.tolist() == ["a"]
-    assert list(tree["coarse"].children) == ["a"]
-    assert list(tree["original"].children) == ["a", "b"]
-    assert "pca" not in tree
-    tree.close()
+def test_an_unfinished_study_opens_with_what_is_there(study_folder, tmp_path):
+    folder = shutil.copytree(study_folder, tmp_path / "study")
+    (folder / "original" / ".c.nc.77.tmp").write_bytes(b"half")
+    for name in ("registration/brain_02", "pca", "report"):
+        (folder / f"{name}.nc").unlink()
+    with open_study(folder) as tree:
+        assert tree["registration"]["shape"].values.tolist() == ["brain_01", "brain_03", "brain_04"]
+        assert "pca" not in tree
+    (folder / "coarse/brain_02.nc").unlink()  # from which the network was made
+    with open_study(folder) as tree:
+        assert list(tree["coarse"].children) == ["brain_01", "brain_03", "brain_04"]
+        assert list(tree["original"].children) == [f"brain_0{i}" for i in (1, 2, 3, 4)]
+        assert "registration" not in tree
 
 
 def test_a_registration_is_read_when_it_is_used_and_only_of_the_shapes_asked_for(

@@ -349,11 +349,14 @@ def test_what_is_no_file_in_a_study_is_not_written_to(folder, tmp_path, capsys, 
     assert (tmp_path / "diary").read_text() == "mine"
 
 
-def test_a_damaged_study_is_no_traceback_for_a_command(folder, capsys):
-    path = folder / "pca.nc"
-    path.write_bytes(path.read_bytes()[:9000])
+def test_a_study_with_a_damaged_file_is_not_opened_and_the_file_is_named(folder, capsys):
+    for name in ("registration/brain_03", "registration", "original/brain_01"):  # read before
+        path = folder / f"{name}.nc"
+        path.write_bytes(path.read_bytes()[:-100])
+        with pytest.raises(OSError, match=f"{name}.nc cannot be read"):
+            open_study(folder)
     assert cli.main(["statistics", str(folder)]) == 2
-    assert "pca.nc cannot be read" in capsys.readouterr().err
+    assert "original/brain_01.nc cannot be read" in capsys.readouterr().err
 
 
 def test_a_report_of_somebody_else_in_a_study_is_not_overwritten(tmp_path):

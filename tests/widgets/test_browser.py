@@ -45,7 +45,6 @@ from small import small_pictures
 import s4a
 from s4a.show import panel_page
 from s4a.show.draw import vertices_within
-from s4a.show.surfaces import aligned
 from s4a_morphometrics.region_panel import Region
 
 pytest.importorskip("playwright.sync_api")
@@ -300,22 +299,6 @@ def test_whatever_can_be_clicked_has_a_name_and_is_reached_by_the_keyboard(page)
     assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid", (
         "focus is seen"
     )
-
-
-def test_nothing_is_cut_off_at_800_pixels(page):
-    page.set_viewport_size({"width": 800, "height": 1300})
-
-    def uncut():
-        for label in page.locator(".s4a-tabs .lm-TabBar-tabLabel").all():
-            assert label.evaluate("(e) => e.scrollWidth <= e.clientWidth + 1"), label.inner_text()
-        assert visible(page, ".s4a").count() > 0
-        for part in visible(page, ".s4a").all():
-            assert part.evaluate("(e) => e.scrollWidth <= e.clientWidth + 2")
-            assert part.bounding_box()["x"] + part.bounding_box()["width"] <= 800
-
-    for title in ("Network", "Modes"):
-        open_tab(page, title)
-        settled(page, uncut)
 
 
 def test_nothing_scrolls_sideways_and_charts_are_visible_next_to_the_files(page):
@@ -677,13 +660,6 @@ def test_the_console_has_no_errors(page, messages):
 # ---- for readers of screens, with axe-core
 
 
-def test_axe_sees_what_it_should(browser):
-    page = browser.new_page()
-    page.set_content('<html lang="en"><title>t</title><input><p style="color:#bbb">faint</p>')
-    assert {rule for rule, _, _ in barriers(page)} == {"color-contrast", "label"}
-    page.close()
-
-
 # ---- every theme
 
 
@@ -925,38 +901,6 @@ def test_the_axes_of_a_matrix_number_its_cells_and_nothing_overlaps(show, map_pa
         down = min(a["y"] + a["height"], b["y"] + b["height"]) - max(a["y"], b["y"])
         assert min(across, down) < 1, (a, b)
     assert max(box["x"] + box["width"] for box in boxes) <= width
-
-
-def test_the_page_of_the_median_ranks_by_the_selected_operator(show, study):
-    page = show(widgets.Median(study))
-    assert barriers(page) == []
-    chosen(page, "operator", "conformal")
-    D = study["latent"]["conformal_difference"].values
-    distance = np.sort(
-        s4a.method.median.distance_to_identity(D, study["latent"]["latent_eigenvalue"].values)
-    )
-    bar = visible(page, "rect.s4a-mark").nth(3)
-    name, value = bar.get_attribute("aria-label").split(": ")
-    assert float(value) == pytest.approx(distance[3], rel=1e-3)
-    bar.click()
-    visible(page, ".s4a-title").filter(has_text=f"{name}, in ").wait_for()
-    visible(page, ".s4a-readout").filter(has_text="rank 4 of 5").wait_for()
-
-
-def test_the_page_of_the_spectrum_shows_eigenfunctions_and_reconstructions(show, study):
-    page = show(widgets.Spectrum(study), n_values=24)
-    move(page.locator("#c-index"), 7)
-    visible(page, ".s4a-title").filter(has_text="φ7 of brain_01").wait_for()
-    canvas = visible(page, VIEW).nth(1)
-    before = vertices(canvas)
-    move(page.locator("#c-k"), 4)
-    visible(page, ".s4a-title").filter(has_text="from 5 of 24").wait_for()
-    mesh = study["coarse"]["brain_01"].to_dataset()
-    X = aligned(study, "brain_01", mesh["position"].values)
-    np.testing.assert_allclose(
-        vertices(canvas), s4a.method.spectral.reconstruct(mesh, X, k=5), atol=1e-3
-    )
-    assert (vertices(canvas) != before).any()
 
 
 def test_the_page_of_correspondences_follows_the_pointer_and_the_keyboard(show, study):

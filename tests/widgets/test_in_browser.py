@@ -2,15 +2,11 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from paths import ROOT, TESTS
-
-from s4a.geometry.compiled import PACKAGES
 
 pytest.importorskip("anywidget")
 
@@ -48,13 +44,3 @@ def test_what_cannot_be_done_says_what_it_needs_and_what_to_do(done):
     assert "pip install robust_laplacian" in said["robust_laplacian"]
     assert "open_study" in said["robust_laplacian"]
     assert "s4a.analyse" in said["processes"]
-
-
-@pytest.mark.parametrize("name", PACKAGES)
-def test_one_module_imports_a_package_that_a_browser_lacks(name):
-    found = [
-        path.name
-        for path in Path(ROOT / "s4a").rglob("*.py")
-        if re.search(rf"^\s*(import|from) {name}\b", path.read_text("utf-8"), re.MULTILINE)
-    ]
-    assert found == []

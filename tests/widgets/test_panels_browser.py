@@ -162,25 +162,6 @@ def test_the_controls_of_a_region_stand_in_one_row_of_a_wide_screen(page):
     assert np.ptp(middles) < 10
 
 
-def test_python_gets_the_vertices_inside_a_lasso(page):
-    panel = panel_of(page, "Region", wide=True)
-    canvas = views(panel).first
-    before, box = pixels(canvas), canvas.bounding_box()
-    panel.get_by_role("button", name="lasso").click()
-    settled(page, lambda: canvas.evaluate("(c) => c.view.lasso"))
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    page.mouse.move(x - 60, y - 60)
-    page.mouse.down()
-    for dx, dy in ((60, -60), (60, 60), (-60, 60)):
-        page.mouse.move(x + dx, y + dy, steps=5)
-    page.mouse.up()
-    said = panel.locator(".s4a-readout").filter(has_text=re.compile("^[1-9]"))
-    said.wait_for()
-    assert pixels(canvas) != before
-    panel.get_by_role("button", name="clear").click()
-    panel.locator(".s4a-readout").filter(has_text=re.compile("^0 of")).wait_for()
-
-
 def test_structures_are_hidden_and_coloured_and_their_poses_moved(page):
     panel = panel_of(page, "Structures", wide=True)
     before = pixels(views(panel).first)

@@ -29,7 +29,6 @@ from s4a.show import charts, panel_page
 from s4a.show.browser import color_bytes
 from s4a.show.charts import PALE
 from s4a.show.draw import cycle_error_colors, cycle_error_limits, position_colors
-from s4a.show.panel_page import widgets_in
 from s4a.show.surfaces import aligned, mesh_of, mode_limits, network_limits
 from s4a.study.progress import status
 from s4a.widgets import (
@@ -47,7 +46,7 @@ from s4a.widgets import explore as explore_module
 from s4a.widgets import network as network_module
 from s4a.widgets import spectrum as spectrum_module
 from s4a.widgets.modes import ModesView
-from s4a.widgets.views import Scene, View
+from s4a.widgets.views import Scene
 
 
 @pytest.fixture
@@ -187,14 +186,6 @@ def test_without_webgl_python_deforms(study):
     along = ((points - mean) * vertex_normals(mean, T)).sum(1)
     assert colors[along.argmax()][2] > colors[along.argmax()][0], "blue is expansion"
     view.close()
-
-
-def test_without_webgl_panels_send_pictures(panel):
-    for kind in (Modes, Network, Correspondence):
-        views = [part for part in widgets_in(panel(kind)) if isinstance(part, View)]
-        for view in views:
-            view.webgl = "no"
-        assert any(view.still[1:4] == b"PNG" for view in views), kind
 
 
 # ---- network, maps
@@ -790,19 +781,6 @@ def test_a_pair_is_chosen_in_all_tabs_that_are_opened_before_or_later(study, mon
     tabs.pair = ("nobody", "brain_01")
     assert maps.pair == 5
     assert all(panel.message.value == "" for panel in tabs.panels.values())
-    tabs.close()
-
-
-def test_every_pair_of_a_network_is_shown_by_all_tabs_without_a_loop(study):
-    tabs = Explore(study)
-    network = tabs["Network"]
-    for edge in range(len(network.source)):
-        tabs["Network"].choice.value = edge
-        pair = str(network.source[edge]), str(network.target[edge])
-        both = tabs["Correspondence"]
-        assert {both.source, both.shape} == set(pair)
-        assert tabs["Functional map"].names() == tabs.pair == pair
-        assert tabs["Network"].edge == edge
     tabs.close()
 
 
