@@ -475,8 +475,7 @@ def _clean_brain(truth, shape, n_vertices, rng):
     x = X.astype(np.float32)
     start = int(rng.integers(len(u)))
     if fpsample:
-        levels = np.log2(len(u))  # of the tree; a sample costs as much as the leaves and a leaf
-        h = int(min(max(7, levels / 2 - 2), levels))  # no leaf may be empty
+        h = min(7, int(np.log2(len(u))))  # levels of the tree; no leaf may be empty
         sample = fpsample.bucket_fps_kdline_sampling(x, n_vertices, h=h, start_idx=start)
     else:
         sample = farthest_samples(x, n_vertices, start)

@@ -183,6 +183,9 @@ class Product:
         return np.asarray(self.U.mean(axis)).ravel() @ self.F
 
 
+Rows = Array | Product
+
+
 @dataclass(frozen=True)
 class Cells:
     """Rows sorted by cell: ``rows[start[c]:start[c + 1]]`` are those of cell c."""
@@ -199,7 +202,7 @@ class Cells:
         return np.diff(self.start)
 
 
-def into_cells(rows: Array | Product, cell: Array, middle: Array | float = 0.0) -> Cells:
+def into_cells(rows: Rows, cell: Array, middle: Array | float = 0.0) -> Cells:
     """Group rows `(n, d)`, less `middle`, by their cell numbers `(n,)`, without empty cells."""
     _, cell = np.unique(cell, return_inverse=True)
     count = np.bincount(cell)
@@ -287,7 +290,7 @@ def _update_nearest(best, index, selected, squared, new):
     index[selected[closer]] = new[closer]
 
 
-def nearest_of_few(Q: Array, D: Array, cell_d: Array, *, block: int = 256) -> Array:
+def nearest_of_few(Q: Array, D: Rows, cell_d: Array, *, block: int = 256) -> Array:
     """Return :func:`nearest_in_cells` for a few distant queries, such as one in every cell.
 
     If the bound excludes nothing, all pairs of a block are compared at once: 1 GB for 60,000
@@ -332,7 +335,7 @@ def nearest_of_few(Q: Array, D: Array, cell_d: Array, *, block: int = 256) -> Ar
 
 
 def nearest_in_cells(
-    Q: Array, cell_q: Array, D: Array, cell_d: Array, *, n_initial: int = 12
+    Q: Rows, cell_q: Array, D: Rows, cell_d: Array, *, n_initial: int = 12
 ) -> tuple[Array, float, float]:
     """Return the index of the nearest row of D for every row of Q, exact up to float32 rounding.
 

@@ -62,7 +62,8 @@ def nearest_vertices(source: Basis, moved: Basis) -> Array:
 
     For its vertices near coarse ones, at low resolution for all.
     """
-    return source.tree.query(features(moved.X, moved.normals)[moved.near_coarse])[1]
+    near = moved.near_coarse
+    return source.tree.query(features(moved.X[near], moved.normals[near]))[1]
 
 
 def fit_warp(source: Basis, target: Basis, match: Array) -> Warp:
