@@ -925,9 +925,8 @@ def million(folder, n=10, n_vertices=1_000_000):
         watch.look(psutil.Process(run.pid), "run")
         time.sleep(0.2)
     wall, spent = time.perf_counter() - begin, watch.stages["run"]
-    say(
-        f"\n{n} shapes of {n_vertices:,} vertices, all defaults, two processes, exit {run.returncode}"
-    )
+    assert run.returncode == 0, f"exit {run.returncode}"
+    say(f"\n{n} shapes of {n_vertices:,} vertices, all defaults, two processes")
     say(f"{wall:.0f} s, {spent['cpu']:.0f} CPU s, at most {spent['memory']:.0f} MiB together\n")
     report = s4a.open_study(folder / "study")["report"]
     for stage, seconds, memory in zip(
