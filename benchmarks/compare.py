@@ -366,7 +366,7 @@ def readings(source, target, transform, match, reverse, functions=None):
         "source, smoothed image (eq. 8)": (X, placed + smoothed(target, image - placed)),
         "the first at 6,000 vertices": [x[v[v >= 0]] for x, v in zip((X, image), low, strict=True)],
     }
-    F, G = (np.ascontiguousarray(f, np.float32) for f in functions or (X, placed))
+    F, G = (np.ascontiguousarray(f[:], np.float32) for f in functions or (X, placed))
     exact = interpolate(X, T, *closest_point_in_star(G, match, F, T))
     points["the first, image between vertices"] = (X, exact)
     gaps = {name: metrics.nearest_distances(*pair) for name, pair in points.items()}

@@ -6,8 +6,9 @@ pyFM is on PyPI as ``pyfmaps`` (the extra ``bench``).  ``speed.py stages``, ``pi
 ``growth``, ``pairs``, ``nearest``, or ``write`` runs one part, ``speed.py methods brains
 faces heads`` an analysis by RE-MATCH and by SCALABLE of ten shapes of each, ``speed.py whole 51
 100000`` the whole analysis of so many synthetic shapes of so many vertices, ``speed.py versions 51
-100000`` the same by an older version and by this one, three times in turn, ``speed.py sizes`` pairs
-of 10,000 to 3.5 million vertices, or of those that are named.
+100000`` the same by an older version and by this one, three times in turn, ``speed.py sizes``
+meshes of 10,000 to 3.5 million vertices, or of those that are named, ``speed.py million`` a study
+of ten shapes of a million.
 """
 
 import io
@@ -26,6 +27,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import psutil
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
@@ -34,7 +36,7 @@ from s4a import metrics, synthetic
 from s4a.evaluation import accuracy
 from s4a.geometry.align import align, farthest_points
 from s4a.geometry.crossing import count_crossing
-from s4a.geometry.mesh import as_arrays, triangle_areas
+from s4a.geometry.mesh import as_arrays, as_dataset, triangle_areas, unique_edges
 from s4a.input.files import find_meshes
 from s4a.method import fmap, latent
 from s4a.method.initial_map import map_after_alignment
@@ -828,12 +830,46 @@ def error_of(images, template, area, truth):
     return 100 * float(np.mean(gaps / np.sqrt([area[name] for name in names])))
 
 
-def write_pair(n_vertices, path):
-    """Two synthetic brains in one file, with the true image of every vertex of the second."""
-    tree = synthetic.brains(2, n_vertices)
-    meshes = [tree["original"][name].to_dataset() for name in ("brain_01", "brain_02")]
-    at = tree["truth"]["brain_02"]["reference_point"].values
-    path.write_bytes(pickle.dumps((*meshes, synthetic.position(tree["truth"], "brain_01", at))))
+def divided(u, T):
+    """Points of the unit sphere and triangles, each divided into four."""
+    E, edge_of, _ = unique_edges(T)
+    a, b, c = T.T
+    ab, bc, ca = (len(u) + edge_of).reshape(3, -1)  # numbers of the midpoints
+    T = np.concatenate(
+        [np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    )
+    middle = u[E].sum(1)
+    return np.concatenate([u, middle / np.linalg.norm(middle, axis=1, keepdims=True)]), T
+
+
+def write_brains(n, n_vertices, folder):
+    """Synthetic brains of about so many vertices as PLY and, of two, in memory with the truth.
+
+    Triangles of 16 times fewer vertices are divided twice; all vertices are on the exact surface.
+    """
+    tree = synthetic.brains(n, n_vertices // 16 + 2)
+    meshes = []
+    for name, mesh in tree["original"].children.items():
+        u, T = tree["truth"][name]["reference_point"].values, mesh["corner_vertex"].values
+        for _ in range(2):
+            u, T = divided(u, T)
+        X = synthetic.position(tree["truth"], name, u)
+        s4a.write_mesh(folder / f"{name}.ply", X, T)
+        meshes.append(as_dataset(X, T))
+    if n == 2:
+        pair = *meshes, synthetic.position(tree["truth"], "brain_01", u)
+        (folder / "pair").write_bytes(pickle.dumps(pair))
+    return len(u)
+
+
+def checked(folder):
+    """Read, clean and examine two files, as ``s4a check`` does."""
+    s4a.read_shapes(folder)
+
+
+def remeshed(path):
+    """Low resolution and spectrum of the first mesh of a pair."""
+    s4a.spectrum(s4a.coarsen(pickle.loads(path.read_bytes())[0]))
 
 
 def matched_pair(path):
@@ -846,12 +882,57 @@ def matched_pair(path):
 
 
 def sizes(folder, *numbers):
-    """Seconds, memory and error of s4a.match_pair by the vertices of both meshes, in memory."""
-    say(f"\n| vertices | CPU s | wall s | MiB | error, % |\n|{' --- |' * 5}")
+    """CPU seconds and memory by the vertices of a mesh, from the file to the match of a pair.
+
+    A file is read and cleaned; two are read, cleaned and examined (`s4a check`); a mesh in memory
+    is remeshed, with its spectrum; two in memory are matched.
+    """
+    parts = ("read", "check two", "remesh", "match two")
+    say(
+        "\n| vertices |"
+        + "".join(f" {part}, CPU s | MiB |" for part in parts)
+        + " wall s | error, % |"
+    )
+    say("|" + " --- |" * 11)
     for n in numbers or (10_000, 30_000, 100_000, 300_000, 1_000_000, 3_500_000):
-        measured(write_pair, n, folder / "pair")  # in a process of its own
-        error, cpu, wall, memory = measured(matched_pair, folder / "pair")
-        say(f"| {n:,} | {cpu:.1f} | {wall:.1f} | {memory:.0f} | {error:.3f} |")
+        files = folder / str(n)
+        files.mkdir()
+        count, *_ = measured(write_brains, 2, n, files)  # in a process of its own
+        rows = [
+            measured(our_read, files / "brain_01.ply"),
+            measured(checked, files),
+            measured(remeshed, files / "pair"),
+            measured(matched_pair, files / "pair"),
+        ]
+        spent = "".join(f" {cpu:.1f} | {memory:.0f} |" for _, cpu, _, memory in rows)
+        error, _, wall, _ = rows[-1]
+        say(f"| {count:,} |{spent} {wall:.1f} | {error:.3f} |")
+        shutil.rmtree(files)
+
+
+def million(folder, n=10, n_vertices=1_000_000):
+    """A study of large shapes on two processes: stages, and memory of all processes together."""
+    measured(write_brains, n, n_vertices, folder)
+    sys.path.insert(0, str(Path(__file__).parent))
+    from large import Watch
+
+    command = [sys.executable, "-m", "s4a", "run", folder, "--out", folder / "study"]
+    begin, watch = time.perf_counter(), Watch()
+    run = subprocess.Popen(
+        [*map(str, command), "--n-jobs", "2"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    while run.poll() is None:
+        watch.look(psutil.Process(run.pid), "run")
+        time.sleep(0.2)
+    wall, spent = time.perf_counter() - begin, watch.stages["run"]
+    assert run.returncode == 0, f"exit {run.returncode}"
+    say(f"\n{n} shapes of {n_vertices:,} vertices, all defaults, two processes")
+    say(f"{wall:.0f} s, {spent['cpu']:.0f} CPU s, at most {spent['memory']:.0f} MiB together\n")
+    report = s4a.open_study(folder / "study")["report"]
+    for stage, seconds, memory in zip(
+        *(report[v].values for v in ("stage", "seconds", "peak_memory")), strict=True
+    ):
+        say(f"{stage:36} {seconds:8.1f} s {memory:8.0f} MiB")
 
 
 def cpu_of(function, times=20):
@@ -891,6 +972,7 @@ PARTS = {
     "whole": whole,
     "versions": versions,
     "sizes": sizes,
+    "million": million,
 }
 
 if __name__ == "__main__":

@@ -53,6 +53,8 @@ SPEED = (
     ("speed.py", "pipelines", "10", "100000"),
     ("speed.py", "whole", "51", "100000"),
     ("speed.py", "versions", "51", "100000"),
+    ("speed.py", "sizes"),
+    ("speed.py", "million"),
     ("widgets.py",),
 )
 FLAGS = ("--speed", "--list", "--rest")

@@ -131,17 +131,37 @@ def features(
     return np.concatenate(columns if spectrum is None else [*columns, spectrum], axis=1)
 
 
-def feature_tree(X: Array, T: Array) -> cKDTree:
-    """KD-tree over the :func:`features` of a surface."""
-    return tree_over(features(X, vertex_normals(X, T)))
+class FeatureTree:
+    """KD-tree over rows of :func:`features`, in the order of whose leaves the rows lie in memory.
 
+    Parameters
+    ----------
+    rows : float ndarray (n, d)
 
-def tree_over(rows: Array) -> cKDTree:
-    """KD-tree over rows of :func:`features`.
-
-    The leaf size suits queries in the order of a mesh.
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.closest import FeatureTree
+    >>> FeatureTree(np.array([[3.0], [1.0], [2.0]])).query(np.array([[1.2]]))[1].tolist()
+    [1]
     """
-    return cKDTree(rows, leafsize=32, balanced_tree=False)
+
+    def __init__(self, rows: Array) -> None:
+        # the leaf size suits queries in the order of a mesh
+        options = {"leafsize": 32, "balanced_tree": False}
+        self.data = rows
+        self._order = cKDTree(rows, **options).indices
+        self._tree = cKDTree(rows.take(self._order, axis=0), **options)
+
+    def query(self, rows: Array) -> tuple[Array, Array]:
+        """Return the distance and the index of the nearest row, for each of some rows (q, d)."""
+        distance, nearest = self._tree.query(rows)
+        return distance, self._order.take(nearest)
+
+
+def feature_tree(X: Array, T: Array) -> FeatureTree:
+    """KD-tree over the :func:`features` of a surface."""
+    return FeatureTree(features(X, vertex_normals(X, T)))
 
 
 def match_surfaces(Y: Array, normals_y: Array, X: Array, normals_x: Array) -> Array:
@@ -166,7 +186,7 @@ def match_surfaces(Y: Array, normals_y: Array, X: Array, normals_x: Array) -> Ar
     >>> bool((match_surfaces(1.01 * X, N, X, N) == range(200)).all())
     True
     """
-    tree = tree_over(features(X, normals_x, weight=_CLOSE_WEIGHT))
+    tree = FeatureTree(features(X, normals_x, weight=_CLOSE_WEIGHT))
     return tree.query(features(Y, normals_y, weight=_CLOSE_WEIGHT))[1]
 
 

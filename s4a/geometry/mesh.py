@@ -14,6 +14,8 @@ from scipy.spatial import cKDTree
 
 from s4a.schema import Array, dataset
 
+_BLOCK = 1 << 14  # triangles whose corners are in the cache at once
+
 
 def as_dataset(
     points: Array, triangles: Array, attrs: dict[str, Any] | None = None, **variables: Any
@@ -34,22 +36,41 @@ def as_arrays(mesh: xr.Dataset) -> tuple[Array, Array]:
 
 def triangle_normals(X: Array, T: Array) -> Array:
     """Return normals of the triangles ``(m, 3)``, with twice their area as length."""
+    normals = np.empty((len(T), 3))
+    for block, vectors in _normals_in_blocks(X, T):
+        normals[block] = np.stack(vectors, axis=1)
+    return normals
+
+
+def _normals_in_blocks(X, T):
+    """Yield slices of the triangles, and x, y and z of their :func:`triangle_normals`."""
     X = np.asarray(X, float)  # products of integers may overflow
-    a, b, c = (X.take(corner, axis=0) for corner in T.T)
-    ux, uy, uz = (b - a).T
-    vx, vy, vz = (c - a).T
-    # written out: np.cross gives the same bits and takes twice as long
-    return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1)
+    for start in range(0, len(T), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        a, b, c = (X.take(corner, axis=0) for corner in T[block].T)
+        ux, uy, uz = (b - a).T
+        vx, vy, vz = (c - a).T
+        # written out: np.cross gives the same bits and takes twice as long
+        yield block, (uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx)
 
 
 def triangle_areas(X: Array, T: Array) -> Array:
     """Return the areas of the triangles ``(m,)``."""
-    return 0.5 * np.linalg.norm(triangle_normals(X, T), axis=1)
+    areas = np.empty(len(T))
+    for block, (x, y, z) in _normals_in_blocks(X, T):
+        areas[block] = 0.5 * np.sqrt(x * x + y * y + z * z)
+    return areas
 
 
 def vertex_areas(X: Array, T: Array) -> Array:
     """Return lumped (barycentric) vertex areas ``(n,)``: a third of each incident triangle."""
     return np.bincount(T.ravel(), np.repeat(triangle_areas(X, T) / 3, 3), len(X))
+
+
+def log_area_shares(X: Array, T: Array) -> Array:
+    """Return logarithms of the shares of the vertices in the area of the surface ``(n,)``."""
+    area = vertex_areas(X, T)
+    return np.log(np.maximum(area / area.sum(), np.finfo(np.float32).tiny))
 
 
 def normal_sums(X: Array, T: Array) -> Array:
@@ -62,9 +83,9 @@ def normal_sums(X: Array, T: Array) -> Array:
     >>> normal_sums(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]))[0]
     array([0., 0., 1.])
     """
-    ones, first_corner = np.ones(T.size), np.arange(0, T.size + 1, 3)
-    touches = sp.csc_matrix((ones, T.ravel(), first_corner), (len(X), len(T)))
-    return touches @ triangle_normals(X, T)
+    corners, normals = T.ravel(), triangle_normals(X, T)
+    sums = [np.bincount(corners, np.repeat(column, 3), len(X)) for column in normals.T]
+    return np.stack(sums, axis=1)
 
 
 def vertex_normals(X: Array, T: Array) -> Array:
@@ -137,9 +158,18 @@ def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
     _check_numbers(start, n)
     start = start.astype(np.int32 if n < 2**31 else np.int64, copy=False)  # the smaller, the faster
     end = np.roll(start, -len(T))
-    ends = np.stack([np.maximum(start, end), np.minimum(start, end)])  # the last is the first key
-    first, edge_of = equal_rows(ends.T)
-    return ends[::-1].take(first, axis=1).T.astype(np.int64), edge_of, np.bincount(edge_of)
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    order = counting_order(low, n)
+    first = np.r_[0, np.cumsum(np.bincount(low, minlength=n))]
+    rows = sp.csr_matrix((order, high.take(order), first), (n, n))
+    rows.sort_indices()
+    order, low = rows.data, low.take(rows.data)  # half-edges, sorted by both ends
+    new = np.ones(len(low), bool)
+    new[1:] = (low[1:] != low[:-1]) | (rows.indices[1:] != rows.indices[:-1])
+    edge_of = np.empty(len(low), np.int64)
+    edge_of[order] = np.cumsum(new) - 1
+    E = np.stack([low[new], rows.indices[new]], axis=1).astype(np.int64)
+    return E, edge_of, np.bincount(edge_of)
 
 
 def _check_numbers(key, n):
@@ -256,7 +286,9 @@ def edge_graph(X: Array, E: Array) -> sp.csr_matrix:
     return half + half.T
 
 
-def path_lengths(G: sp.csr_matrix, start: Array, end: Array, limit: float) -> Array:
+def path_lengths(
+    G: sp.csr_matrix, start: Array, end: Array, limit: float, X: Array | None = None
+) -> Array:
     """Return lengths of shortest edge paths between pairs of vertices ``(p,)``, at most `limit`.
 
     An edge is the shortest path between its ends.  For other pairs, short paths are searched first,
@@ -269,6 +301,8 @@ def path_lengths(G: sp.csr_matrix, start: Array, end: Array, limit: float) -> Ar
     start, end : int ndarray (p,)
     limit : float
         In the unit of the edges.
+    X : float ndarray (n, 3), optional
+        Positions.  Of a large surface, short paths are then searched around their ends only.
 
     Examples
     --------
@@ -283,14 +317,28 @@ def path_lengths(G: sp.csr_matrix, start: Array, end: Array, limit: float) -> Ar
         return np.zeros(0)
     edge = np.asarray(G[start, end]).ravel()
     length = np.where(start == end, 0.0, np.where(edge > 0, edge, np.inf))
+    if X is not None:
+        _find_short_paths(X, G, start, end, 0.1 * limit, length)
+    step = max(1, min(64, 2**22 // G.shape[0]))  # origins at a time: at most 32 MB of distances
     for reach in (0.1 * limit, limit):
         missing = np.flatnonzero(np.isinf(length))
         origin, row = np.unique(start[missing], return_inverse=True)
-        for first in range(0, len(origin), 64):
-            distance = dijkstra(G, indices=origin[first : first + 64], limit=reach)  # (64, n)
-            here = (row >= first) & (row < first + 64)
+        for first in range(0, len(origin), step):
+            distance = dijkstra(G, indices=origin[first : first + step], limit=reach)  # (step, n)
+            here = (row >= first) & (row < first + step)
             length[missing[here]] = distance[row[here] - first, end[missing[here]]]
     return np.minimum(length, limit)
+
+
+def _find_short_paths(X, G, start, end, longest, length):
+    """Enter paths of at most three times the distance of their ends, and at most `longest`."""
+    reach = 3 * np.linalg.norm(X[start] - X[end], axis=1)
+    pair = np.flatnonzero(np.isinf(length) & (reach < longest))
+    tree = cKDTree(X, balanced_tree=False, compact_nodes=False)
+    balls = tree.query_ball_point(X[start[pair]], reach[pair], return_sorted=True)
+    for i, ball in zip(pair, map(np.array, balls), strict=True):
+        first, last = np.searchsorted(ball, (start[i], end[i]))
+        length[i] = dijkstra(G[ball][:, ball], indices=first, limit=reach[i])[last]
 
 
 def half_cotangents(X: Array, T: Array) -> Array:

@@ -16,12 +16,14 @@ and the rest are searched, too::
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 
 from s4a.geometry.mesh import counting_order
 from s4a.schema import Array
 
 BLOCK = 512  # cells of queries whose distances to all other cells are in memory at once
 PAIRS = 2048  # pairs of rows at a time: their differences, 0.8 MB in 100 dims, fit into the cache
+_BLOCK_OF_ROWS = 1 << 13  # rows that are sorted at a time
 _AROUND = 128  # queries whose candidates are gathered at once: 1.6 MB for 32 each in 100 dims
 _SLACK = 1 + 1e-5  # factor on bounds, for float32 rounding
 
@@ -149,6 +151,42 @@ def nearest_around(q: Array, rows: Array, near: Array) -> Array:
 
 
 @dataclass(frozen=True)
+class Product:
+    """Rows of a matrix product U F, computed when they are asked for.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import scipy.sparse as sp
+    >>> from s4a.method.nearest import Product
+    >>> U = sp.csr_matrix([[1.0, 0], [0.5, 0.5], [0, 1]])
+    >>> Product(U, np.array([[2.0], [4.0]]))[np.array([1])].tolist()
+    [[3.0]]
+    """
+
+    U: sp.csr_matrix  # (n, n_low)
+    F: Array  # (n_low, d)
+
+    def __len__(self) -> int:
+        return self.U.shape[0]
+
+    def __getitem__(self, rows: Array) -> Array:
+        return self.U[rows] @ self.F
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Numbers of rows and columns."""
+        return self.U.shape[0], self.F.shape[1]
+
+    def mean(self, axis: int = 0) -> Array:
+        """Mean of the rows ``(d,)``."""
+        return np.asarray(self.U.mean(axis)).ravel() @ self.F
+
+
+Rows = Array | Product
+
+
+@dataclass(frozen=True)
 class Cells:
     """Rows sorted by cell: ``rows[start[c]:start[c + 1]]`` are those of cell c."""
 
@@ -164,18 +202,20 @@ class Cells:
         return np.diff(self.start)
 
 
-def into_cells(rows: Array, cell: Array, middle: Array | float = 0.0) -> Cells:
+def into_cells(rows: Rows, cell: Array, middle: Array | float = 0.0) -> Cells:
     """Group rows `(n, d)`, less `middle`, by their cell numbers `(n,)`, without empty cells."""
     _, cell = np.unique(cell, return_inverse=True)
     count = np.bincount(cell)
     order = counting_order(cell, len(count))
-    rows = rows.take(order, axis=0)
-    rows -= middle
-    rows = rows.astype(np.float32, copy=False)
+    in_order = np.empty(rows.shape, np.float32)
+    for i in range(0, len(order), _BLOCK_OF_ROWS):  # no second copy of all rows
+        some = slice(i, i + _BLOCK_OF_ROWS)
+        in_order[some] = rows[order[some]] - middle
+    rows = in_order
     start = np.concatenate([[0], np.cumsum(count)])
     center = np.add.reduceat(rows, start[:-1], axis=0) / count[:, None].astype(np.float32)
     distance = np.empty(len(rows), np.float32)
-    for i in range(0, len(count), BLOCK):  # no second copy of all rows
+    for i in range(0, len(count), BLOCK):
         begin, end = start[[i, min(i + BLOCK, len(count))]]
         offset = rows[begin:end] - np.repeat(center[i : i + BLOCK], count[i : i + BLOCK], axis=0)
         distance[begin:end] = np.linalg.norm(offset, axis=1)
@@ -250,7 +290,7 @@ def _update_nearest(best, index, selected, squared, new):
     index[selected[closer]] = new[closer]
 
 
-def nearest_of_few(Q: Array, D: Array, cell_d: Array, *, block: int = 256) -> Array:
+def nearest_of_few(Q: Array, D: Rows, cell_d: Array, *, block: int = 256) -> Array:
     """Return :func:`nearest_in_cells` for a few distant queries, such as one in every cell.
 
     If the bound excludes nothing, all pairs of a block are compared at once: 1 GB for 60,000
@@ -277,7 +317,7 @@ def nearest_of_few(Q: Array, D: Array, cell_d: Array, *, block: int = 256) -> Ar
     >>> bool((nearest_of_few(rows[:20], rows, np.arange(300) % 7) == np.arange(20)).all())
     True
     """
-    middle = np.mean(D, axis=0)
+    middle = D.mean(axis=0)
     Q, cells = np.asarray(Q - middle, np.float32), into_cells(D, cell_d, middle)
     best, index = np.full(len(Q), np.inf, np.float32), np.full(len(Q), len(D))
     for i in range(0, len(Q), block):
@@ -295,7 +335,7 @@ def nearest_of_few(Q: Array, D: Array, cell_d: Array, *, block: int = 256) -> Ar
 
 
 def nearest_in_cells(
-    Q: Array, cell_q: Array, D: Array, cell_d: Array, *, n_initial: int = 12
+    Q: Rows, cell_q: Array, D: Rows, cell_d: Array, *, n_initial: int = 12
 ) -> tuple[Array, float, float]:
     """Return the index of the nearest row of D for every row of Q, exact up to float32 rounding.
 
@@ -330,7 +370,7 @@ def nearest_in_cells(
     >>> bool((index == np.arange(300)).all())
     True
     """
-    middle = np.mean(D, axis=0)
+    middle = D.mean(axis=0)
     queries, cells = into_cells(Q, cell_q, middle), into_cells(D, cell_d, middle)
     index = np.empty(len(Q), np.int64)
     n_initial = min(n_initial, len(cells.center))

@@ -11,7 +11,7 @@ import xarray as xr
 
 from s4a.geometry.align import RigidTransform
 from s4a.geometry.closest import closest_point_in_star, interpolate, match_surfaces
-from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas
+from s4a.geometry.mesh import as_arrays, log_area_shares, triangle_areas
 from s4a.method import spectral_icp
 from s4a.method.deform import displacement_in_template, distortion
 from s4a.method.elastic import (
@@ -506,7 +506,7 @@ def strain_quantile(moved: Basis, target: Basis) -> float:
 
     The strain is large where neighbouring vertices are registered to different folds.
     """
-    strain = np.abs(log_area_ratio(moved.X, target.X, target.T))
+    strain = np.abs(moved.log_area_shares - target.log_area_shares)
     return float(np.quantile(strain, 0.99))
 
 
@@ -623,11 +623,7 @@ def log_area_ratio(image: Array, X: Array, T: Array) -> Array:
     >>> (log_area_ratio(2 * X, X, T) + 0.0).tolist()
     [0.0, 0.0, 0.0]
     """
-    after, before = (
-        np.maximum(area / area.sum(), np.finfo(np.float32).tiny)
-        for area in (vertex_areas(image, T), vertex_areas(X, T))
-    )
-    return np.log(after) - np.log(before)
+    return log_area_shares(image, T) - log_area_shares(X, T)
 
 
 def common_unit(*meshes: xr.Dataset) -> str:

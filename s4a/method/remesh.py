@@ -147,8 +147,10 @@ def _sorted_mesh(X, T, key=None):
     return X[order], T[surface.lexical_order(np.stack([T[:, 2], first_two], axis=1))], order
 
 
-def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
+def _coarse_surface(X, T, found, n_coarse, seed=0, sampling="normals"):
     """Manifold dual of about `n_coarse` geodesic Voronoi cells.
+
+    `found` are the edges of the mesh and the triangles per edge.
 
     Returns
     -------
@@ -164,7 +166,8 @@ def _coarse_surface(X, T, n_coarse, seed=0, sampling="normals"):
     origin = np.arange(len(X))  # row of X of each vertex of V, -1 for the centre of a fan
     is_cut = False
     for max_samples in [MAX_SHARE * n_coarse] * (1 + _N_CUTS) + [np.inf]:
-        graph = voronoi.mesh_graph(V, F)
+        graph = voronoi.mesh_graph(V, F, found)
+        found = None  # of the surface before cuts
         is_centre = origin < 0
         n_initial = max(4, round(INITIAL_SHARE * n_coarse))
         if sampling == "geodesic":
@@ -259,9 +262,11 @@ def _nearest_with_normal(X, T, V, F):
     return tree.query(np.c_[X, weight * vertex_normals(X, T)])[1]
 
 
-def topology(T: Array) -> dict[str, int]:
-    """Count Euler characteristic, boundary loops and edges with three or more triangles."""
-    E, _, count = surface.unique_edges(T)
+def topology(T: Array, E: Array, count: Array) -> dict[str, int]:
+    """Count Euler characteristic, boundary loops and edges with three or more triangles.
+
+    E and `count` are the edges and the triangles per edge.
+    """
     boundary, vertex = np.unique(E[count == 1], return_inverse=True)
     loop = surface.components(vertex.reshape(-1, 2), len(boundary))
     return {
@@ -271,20 +276,25 @@ def topology(T: Array) -> dict[str, int]:
     }
 
 
-def check_clean(X: Array, T: Array) -> dict[str, int]:
-    """Return the topology of a mesh after checking that :func:`coarsen` can process it.
+def _check_numbers(X, T):
+    if len(T) == 0 or T.min() < 0 or T.max() >= len(X) or not np.isfinite(X).all():
+        raise ValueError(
+            "coarsen needs triangles with valid indices and finite positions; found others: "
+            "clean the mesh first"
+        )
+
+
+def check_clean(X: Array, T: Array) -> tuple[dict[str, int], tuple[Array, Array]]:
+    """Return topology, edges and triangles per edge after checking for :func:`coarsen`.
 
     Raises
     ------
     ValueError
         Unless positions are finite, indices valid, vertices in use and edges manifold.
     """
-    if len(T) == 0 or T.min() < 0 or T.max() >= len(X) or not np.isfinite(X).all():
-        raise ValueError(
-            "coarsen needs triangles with valid indices and finite positions; found others: "
-            "clean the mesh first"
-        )
-    counts = topology(T)
+    _check_numbers(X, T)
+    found = surface.unique_edges(T, len(X))[::2]
+    counts = topology(T, *found)
     unused, nonmanifold = len(X) - surface.n_used(T), counts["nonmanifold_edges"]
     if unused or nonmanifold:
         raise ValueError(
@@ -292,7 +302,7 @@ def check_clean(X: Array, T: Array) -> dict[str, int]:
             f"found {nonmanifold} edges of three or more triangles and "
             f"{unused} vertices without triangle: clean the mesh first"
         )
-    return counts
+    return counts, found
 
 
 def coarsen(
@@ -399,15 +409,20 @@ def coarsen(
     mesh = as_mesh(mesh)
     check_count("n_coarse", n_coarse, 4)
     check("sampling", sampling)
-    before = check_clean(*as_arrays(mesh))
+    X, T = as_arrays(mesh)
+    _check_numbers(X, T)
+    X, T, order = _sorted_mesh(X, T)
+    before, found = check_clean(X, T)
     attrs: dict[str, int | str] = {
         "n_coarse": int(n_coarse),
         "seed": int(seed),
         "wrapped": int(bool(wrap)),
         "kept_whole": 0,
     }
-    X, T, order = _sorted_mesh(*as_arrays(mesh))
-    V, F, _ = _sorted_mesh(*alpha_wrap(X, T)) if wrap else (X, T, None)
+    V, F = X, T
+    if wrap:
+        V, F, _ = _sorted_mesh(*alpha_wrap(X, T))
+        found = surface.unique_edges(F, len(V))[::2]
     if len(V) <= n_coarse:
         Y, C = V, F
         sample = cell = np.arange(len(V))
@@ -415,7 +430,7 @@ def coarsen(
             kept_whole=1, samples_first=len(V), samples_added=0, iterations=0, vertices_cut=0
         )
     else:
-        Y, C, sample, cell, counts = _coarse_surface(V, F, n_coarse, seed, sampling)
+        Y, C, sample, cell, counts = _coarse_surface(V, F, found, n_coarse, seed, sampling)
         attrs |= counts
     if wrap:
         sample = np.full(len(Y), -1)
@@ -433,7 +448,7 @@ def coarsen(
         shares = weight * vertex_areas(X, T)[:, None]
         area = np.bincount(corner.ravel(), shares.ravel(), len(Y))
     E, w, area, attrs["laplacian"] = laplacian(Y, C, area)
-    attrs |= topology(C)
+    attrs |= topology(C, *surface.unique_edges(C)[::2])
     attrs |= {f"{name}_original": count for name, count in before.items()}
     rank = np.argsort(order)  # back to the numbering of the input
     return dataset(

@@ -22,9 +22,10 @@ from s4a.geometry.align import (
     many_farthest_points,
     rigid_transform,
 )
-from s4a.geometry.closest import Stars, features, interpolation_matrix, stars, tree_over
+from s4a.geometry.closest import FeatureTree, Stars, features, interpolation_matrix, stars
 from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
 from s4a.method.deform import smoother
+from s4a.method.nearest import Product
 from s4a.method.remesh import laplacian
 from s4a.method.spectral import Diffusion, project, unit_area, unit_mass
 from s4a.options import N_CENTRAL, N_SAMPLES
@@ -102,14 +103,14 @@ class Basis:
         """Return the surface with vertices moved to X ``(n, 3)``, as registered."""
         return replace(self, X=X, surface_normals=None)
 
-    def extend(self, F: Array) -> Array:
-        """Extend functions of the low resolution to all vertices: U F ``(n, q)``, single precision.
+    def extend(self, F: Array) -> Array | Product:
+        """Extend functions of the low resolution to all vertices: U F ``(n, q)``, by rows.
 
         Functions with a row for every vertex are returned unchanged.
         """
         if self.U is None or len(F) == len(self.X):
             return F
-        return self.U @ F.astype(np.float32)
+        return Product(self.U, F.astype(np.float32).astype(float))
 
     def field(self, c: Array) -> Array:
         """Return the field U Phi c ``(n, 3)`` with coefficients c ``(q, 3)``."""
@@ -142,19 +143,19 @@ class Basis:
         return cloud(self.X, self.area, self.sample_vertices_of(N_PAIRED), normals)
 
     @cached_property
-    def tree(self) -> cKDTree:
+    def tree(self) -> FeatureTree:
         """KD-tree over position and normal of the vertices, 6 dims."""
-        return tree_over(features(self.X, self.normals))
+        return FeatureTree(features(self.X, self.normals))
 
-    def guided_tree(self, names: tuple[str, ...]) -> cKDTree:
+    def guided_tree(self, names: tuple[str, ...]) -> FeatureTree:
         """Return the KD-tree over position, normal and some fields, 6 dims and one for each."""
         if names not in self._trees:
             rows = np.concatenate([self.tree.data, field_columns(self, names)], axis=1)
-            self._trees[names] = tree_over(rows)
+            self._trees[names] = FeatureTree(rows)
         return self._trees[names]
 
     @cached_property
-    def _trees(self) -> dict[tuple[str, ...], cKDTree]:
+    def _trees(self) -> dict[tuple[str, ...], FeatureTree]:
         return {(): self.tree}
 
     @cached_property
@@ -172,6 +173,11 @@ class Basis:
             return moved
         R, _, _ = rigid_transform(self.X, X, self.area)
         return surface.rotated(self.surface_normals @ R.T, self.normals @ R.T, moved)
+
+    @cached_property
+    def log_area_shares(self) -> Array:
+        """Logarithms of the shares of the vertices in the area ``(n,)``."""
+        return surface.log_area_shares(self.X, self.T)
 
     @cached_property
     def stars(self) -> Stars:

@@ -26,6 +26,7 @@ from s4a.schema import Array
 
 POSE_DISTANCE = 0.035  # 90 % quantile of distances above which poses differ, see `poses_differ`
 N_TRIPS, LONGEST_TRIP = 300, 0.5  # samples of the round trip, and its largest error
+MANY = 20_000  # vertices above which paths are searched locally
 GOOD = 0.03  # score up to which no spectral coordinates are tried
 
 Warp = tuple[Array, Array, Array]
@@ -61,7 +62,8 @@ def nearest_vertices(source: Basis, moved: Basis) -> Array:
 
     For its vertices near coarse ones, at low resolution for all.
     """
-    return source.tree.query(features(moved.X, moved.normals)[moved.near_coarse])[1]
+    near = moved.near_coarse
+    return source.tree.query(features(moved.X[near], moved.normals[near]))[1]
 
 
 def fit_warp(source: Basis, target: Basis, match: Array) -> Warp:
@@ -207,7 +209,8 @@ def registration_score(source: Basis, target: Basis, match: Array, moved: Basis)
     n_samples = min(N_TRIPS, len(match))
     sample = target.outwards[np.linspace(0, len(match) - 1, n_samples).astype(int)]
     end = tree.query(source.tree.data[match[sample]])[1]
-    trip = path_lengths(target.graph, rows[sample], end, LONGEST_TRIP)
+    near = target.X if len(X) > MANY else None
+    trip = path_lengths(target.graph, rows[sample], end, LONGEST_TRIP, near)
     return float(
         trip.mean() + distance.mean() + back_distance.mean() + _landmark_distance(source, target, X)
     )
