@@ -6,7 +6,6 @@ functions of :mod:`s4a.study.tasks`.
 """
 
 import logging
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from s4a.method.remesh import check_wrap
 from s4a.options import DECLARED, Options, given_options
 from s4a.schema import POSE, dataset
 from s4a.study.netcdf import arrays, attributes, is_done, open_file, read
-from s4a.study.processes import limited
+from s4a.study.processes import limited, temporary_folder
 from s4a.study.quality_control import (
     check_modes,
     check_plausibility,
@@ -169,7 +168,7 @@ def analyse(
     given = {name: value for name, value in named.items() if value is not None}
     settings = given_options(given | others, options)
     if store is None:
-        with tempfile.TemporaryDirectory(prefix="s4a-") as folder:
+        with temporary_folder() as folder:
             study = analyse(shapes, options=settings, store=folder, n_jobs=n_jobs)
             loaded = {n.path: n.to_dataset(inherit=False).load() for n in study.subtree}
             return xr.DataTree.from_dict(loaded)

@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 
 CAN_LOCK = find_spec("fcntl") is not None  # not on Windows
 PR_SET_PDEATHSIG, M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = 1, -1, -3  # of Linux and glibc
+TEMPORARY = "s4a-"  # prefix of the folder of a temporary study
 
 
 def limited(n_jobs: int | None, n_tasks: int | None = None) -> int | None:
@@ -183,6 +184,29 @@ def died(error: Exception) -> str:
     )
 
 
+@contextlib.contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Make a folder for a temporary study, removed at the end with those of killed runs."""
+    remove_abandoned(Path(tempfile.gettempdir()))
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as name, locked(Path(name)):
+        yield Path(name)
+
+
+def remove_abandoned(parent: Path) -> None:
+    """Remove temporary studies that no process has locked."""
+    if not CAN_LOCK:
+        return
+    for folder in parent.glob(f"{TEMPORARY}????????"):
+        with contextlib.suppress(OSError), locked(folder):
+            # a new folder is locked before it has a file
+            old = time.time() - folder.stat().st_mtime > 3600
+            lock = folder / ".lock"
+            if folder.stat().st_uid == os.getuid() and (old or lock.is_file()):
+                token = lock.read_text() if lock.is_file() else ""
+                shutil.rmtree(folder, ignore_errors=True)
+                remove_remains(token)
+
+
 def try_lock(handle: int) -> bool:
     """Lock an open file or folder; return False if the system cannot.
 
@@ -196,3 +220,17 @@ def try_lock(handle: int) -> bool:
 
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     return CAN_LOCK
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Lock a folder until this process ends; OSError if another process has locked it."""
+    if not CAN_LOCK:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        try_lock(handle)
+        yield
+    finally:
+        os.close(handle)

@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -19,7 +20,7 @@ import pytest
 
 from s4a import analyse, cli, open_study, synthetic
 from s4a.schema import dataset
-from s4a.study import netcdf, pipeline, quality_control, sources, store, tasks
+from s4a.study import netcdf, pipeline, processes, quality_control, sources, store, tasks
 from s4a.study.progress import FILE
 from s4a.study.runner import Run
 
@@ -143,6 +144,21 @@ def test_a_run_killed_with_its_workers_resumes_and_removes_their_files(files, tm
     assert not remains(run.pid)
     assert not list(folder.rglob(".*.tmp"))
     assert not list(folder.glob(".log/**/*.txt"))
+
+
+def test_temporary_studies_of_killed_runs_are_removed_and_those_of_others_stay(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    for name in ("s4a-abandond", "s4a-of_other", "s4a-begin_ng", "s4a-thoughts"):
+        (tmp_path / name).mkdir()
+    for name in ("s4a-abandond", "s4a-of_other"):
+        (tmp_path / name / ".lock").write_text("")
+    with processes.locked(tmp_path / "s4a-of_other"), processes.temporary_folder() as folder:
+        assert folder.parent == tmp_path
+        left = {path.name for path in tmp_path.iterdir()}
+        assert left == {"s4a-of_other", "s4a-begin_ng", "s4a-thoughts", folder.name}
+    assert not folder.exists()
 
 
 KILLED = """
