@@ -74,9 +74,9 @@ def test_pages_have_nothing_serious_for_axe_fit_their_window_and_are_found(site,
             window.set_viewport_size({"width": width, "height": 700})
             scrolled = window.evaluate("document.documentElement.scrollWidth")
             bad += [(name, width, scrolled)] if scrolled > width else []
-        for scheme, rules in (("light", None), ("dark", {"runOnly": ["color-contrast"]})):
+        for scheme in ("light", "dark"):
             window.emulate_media(color_scheme=scheme)
-            found = axe.Axe().run(window, options=rules).response["violations"]
+            found = axe.Axe().run(window).response["violations"]
             bad += [
                 (name, scheme, v["id"]) for v in found if v["impact"] in ("serious", "critical")
             ]
