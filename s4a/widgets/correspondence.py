@@ -4,6 +4,7 @@ import ipywidgets
 import numpy as np
 import traitlets
 
+from s4a.analysis.transfer import correspondence
 from s4a.method.steps import latent_match
 from s4a.schema import Array
 from s4a.show.browser import color_scale
@@ -33,19 +34,6 @@ COLORS = (
     "registration's confidence from 0 to 1"
 )
 CELLS = 14  # of the checkerboard along the surface's extent
-
-
-def compose(first: Array, second: Array) -> Array:
-    """Return the composition of two matches, -1 where the first has none.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from s4a.widgets.correspondence import compose
-    >>> compose(np.array([1, -1, 0]), np.array([7, 8])).tolist()
-    [8, -1, 7]
-    """
-    return np.where(first < 0, -1, second[first])
 
 
 def inverse(match: Array, n: int) -> Array:
@@ -106,7 +94,7 @@ class Correspondence(Panel):
         self.scenes = [self.new_scene(400, clickable=True) for _ in range(2)]
         self.hover = self.follow()
         self.selected_pair, self.shown = ("", ""), ("", "")
-        self.matches = {}  # (shape, map) -> match
+        self.matches, self.points = {}, {}  # by source, shape and map; by source and target
         self.bind(self.left, "source")
         self.bind(self.choice, "shape")
         self.redraw(self.draw, self.map, self.colors)
@@ -158,10 +146,9 @@ class Correspondence(Panel):
     def match(self) -> Array:
         """Return the matched vertex of the shape for each vertex of the source; -1 for none."""
         if self.registered:
-            match = self.registered_match(self.shape)
-            if not self.from_template:
-                match = compose(self.to_template(self.source, self.pair[0][0]), match)
-            return match
+            if self.from_template:
+                return self.registered_match(self.shape)
+            return self.nearest_corner(self.source, self.shape)
         key = self.source, self.shape, self.map.value
         if key not in self.matches:
             full = self.map.value == "dense"
@@ -174,22 +161,34 @@ class Correspondence(Panel):
         Y = self.pair[1][0]
         if not self.registered:
             return inverse(self.match(), len(Y))
-        match = self.to_template(self.shape, Y)
-        return match if self.from_template else compose(match, self.registered_match(self.source))
+        if not self.from_template:
+            return self.nearest_corner(self.shape, self.source)
+        vertices = template_vertices(self.study, self.shape)
+        return inverse(self.registered_match(self.shape), len(Y)) if vertices is None else vertices
+
+    def points_on(self, source: str, target: str) -> tuple[Array, Array]:
+        """Return corners and weights ``(n, 3)`` of the images of the source's vertices."""
+        if (source, target) not in self.points:
+            found = correspondence(self.study, source, target)
+            T = mesh_of(self.study["original"][target].dataset)[1]
+            corners = T[found["image_triangle"].values]
+            self.points[source, target] = corners, found["image_barycentric"].values
+        return self.points[source, target]
+
+    def nearest_corner(self, source: str, target: str) -> Array:
+        """Return the target's vertex that is nearest to the image of each vertex of the source."""
+        corners, weights = self.points_on(source, target)
+        return np.take_along_axis(corners, weights.argmax(1)[:, None], axis=1)[:, 0]
 
     def registered_match(self, name: str) -> Array:
         """Return the matched vertex of a shape for each vertex of the template."""
         return self.study["registration"].dataset["registered_match"].sel(shape=name).values
 
-    def to_template(self, name: str, X: Array) -> Array:
-        """Return the template's vertex for each vertex `X` of a shape; -1 for none."""
-        vertices = template_vertices(self.study, name)
-        return inverse(self.registered_match(name), len(X)) if vertices is None else vertices
-
     def transferred(self, values: Array) -> Array | None:
         """Return values of the source's vertices on those of the shape, through the template."""
         if not self.from_template:
-            values = values[self.registered_match(self.source)]
+            corners, weights = self.points_on(self.shape, self.source)
+            return np.einsum("nc,ncx->nx", weights, values[corners])
         transferred = transferred_colors(self.study, self.shape, values)
         return None if transferred is None else transferred[2]
 

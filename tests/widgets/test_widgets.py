@@ -392,6 +392,11 @@ def test_two_shapes_are_matched_through_the_template(study, panel):
     size = np.ptp(Y, axis=0).max()
     assert np.median(np.linalg.norm(Y[there[on_source]] - Y[on_shape], axis=1)) < 0.02 * size
     assert np.median(np.linalg.norm(X[back[there]] - X, axis=1)) < 0.03 * size
+    # the surfaces are composed, so only the last point is rounded to a vertex
+    image = s4a.correspondence(study, source, shape)["image_position"].values
+    Y, T = study["original"][shape]["position"].values, both.pair[1][1]
+    longest = max(np.linalg.norm(Y[T[:, i]] - Y[T[:, i - 1]], axis=1).max() for i in range(3))
+    assert np.linalg.norm(Y[there] - image, axis=1).max() <= 0.6 * longest
     colors = [np.frombuffer(view.color, np.uint8).reshape(-1, 3) for view in both.scenes]
     assert np.abs(colors[0].astype(int) - colors[1][there]).mean() < 6
     both.scenes[0].picked = {"vertex": 17, "count": 1}
