@@ -195,10 +195,10 @@ def pytest_terminal_summary(terminalreporter):
 
 # files that take long begin first, the longest before all, so that no worker waits for the other
 SLOW = """
-notebooks browser site pages interruptions faults panels_browser widgets several complete pipeline
-scenes_browser quality_control in_browser release leave_one_out scalable_study insert cluster fuzz
-extension properties study_files labels cli landmarks reflect preset asymmetry subjects plausibility
-features raw initial_map steps compare two_block save_browser touch_browser
+notebooks browser pages site interruptions panels_browser study_files several faults quality_control
+scenes_browser leave_one_out scalable_study labels insert save_browser complete widgets pipeline
+steps initial_map cli release subjects landmarks plausibility in_browser reflect compare cluster
+preset touch_browser properties fuzz features asymmetry extension raw two_block
 """.split()
 
 

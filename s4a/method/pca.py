@@ -293,8 +293,8 @@ def synthesize(study: xr.DataTree, scores: Array) -> xr.Dataset:
 
     The first mode of variation of five larger brains:
 
-    >>> brains = s4a.synthetic.brains(5, 3000)
-    >>> larger = s4a.analyse(brains, n_coarse=500, k=40, intersections=False)
+    >>> brains = s4a.synthetic.brains(5, 1500)
+    >>> larger = s4a.analyse(brains, n_coarse=300, k=30, intersections=False)
     >>> along = {f"{x:+} sd": s4a.synthesize(larger, [float(x)]) for x in (-2, 0, 2)}
     >>> s4a.show.charts.surfaces(along, view="left")
     <TiledFigure ...>

@@ -402,38 +402,36 @@ def test_landmarks_are_written_as_a_table_and_other_tables_are_refused(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("read", "text", "said"),
     [
-        ("name,x,y,z\n# picked by hand\na,1,2,3\n\nb,1,2\n", "line 5 needs 4 cells.* found 3"),
-        ("name,x,y,z\na,1,2,3\nb,1,5,2,5,3,5\n", "line 3 needs 4 cells.* found 7: 'b, 1, 5"),
-        ("a 1 2 3\nb 4\n", "line 2 needs 4 cells.* found 2"),
-        ("name;x;y;z\na;1,5;2;3\n", "line 2 needs a number, found '1,5'"),
-        ("name,x,y,z,curve,closed\na,1,2,3\n", "line 2 needs 6 cells.* found 4"),
+        (
+            read_landmarks,
+            "name,x,y,z\n# picked by hand\na,1,2,3\n\nb,1,2\n",
+            "line 5 needs 4 cells.* found 3",
+        ),
+        (
+            read_landmarks,
+            "name,x,y,z\na,1,2,3\nb,1,5,2,5,3,5\n",
+            "line 3 needs 4 cells.* found 7: 'b, 1, 5",
+        ),
+        (read_landmarks, "a 1 2 3\nb 4\n", "line 2 needs 4 cells.* found 2"),
+        (read_landmarks, "name;x;y;z\na;1,5;2;3\n", "line 2 needs a number, found '1,5'"),
+        (read_landmarks, "name,x,y,z,curve,closed\na,1,2,3\n", "line 2 needs 6 cells.* found 4"),
+        (read_labels, "vertex,label\n0,a\n1\n", "line 3 needs 2 cells.* found 1"),
+        (read_labels, "vertex,label\n0,a\nb,a\n", "line 3 needs a number, found 'b'"),
     ],
 )
-def test_an_invalid_row_of_landmarks_is_named_with_its_line(tmp_path, text, said):
-    (tmp_path / "points.csv").write_text(text)
-    with pytest.raises(ValueError, match=rf"points\.csv cannot be read as landmarks: {said}"):
-        read_landmarks(tmp_path / "points.csv")
+def test_an_invalid_row_is_named_with_its_line(tmp_path, read, text, said):
+    (tmp_path / "rows.csv").write_text(text)
+    kind = read.__name__.removeprefix("read_")
+    with pytest.raises(ValueError, match=rf"rows\.csv cannot be read as {kind}: {said}"):
+        read(tmp_path / "rows.csv")
 
 
 def test_empty_cells_behind_a_row_and_comments_change_no_landmark(tmp_path):
     (tmp_path / "points.csv").write_text("name,x,y,z,note\n# by hand\na,1,2,3,,\nb,4,5,6\n")
     found = read_landmarks(tmp_path / "points.csv")["landmark_position"].values
     assert found.tolist() == [[1, 2, 3], [4, 5, 6]]
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("vertex,label\n0,a\n1\n", "line 3 needs 2 cells.* found 1"),
-        ("vertex,label\n0,a\nb,a\n", "line 3 needs a number, found 'b'"),
-    ],
-)
-def test_an_invalid_row_of_labels_is_named_with_its_line(tmp_path, text, said):
-    (tmp_path / "labels.csv").write_text(text)
-    with pytest.raises(ValueError, match=rf"labels\.csv cannot be read as labels: {said}"):
-        read_labels(tmp_path / "labels.csv")
 
 
 def test_curves_of_slicer_and_of_tables_come_out_of_their_files_in_order(tmp_path):

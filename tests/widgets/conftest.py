@@ -20,6 +20,23 @@ def small_stills():
         yield
 
 
+@pytest.fixture
+def closed_later():
+    """Make panels that are closed after the test, when nothing of them may be left."""
+    from ipywidgets.widgets import widget as registry  # the open widgets are counted in it
+
+    before, made = len(registry._instances), []
+
+    def make(kind, *values, **options):
+        made.append(kind(*values, **options))
+        return made[-1]
+
+    yield make
+    for panel in made:
+        panel.close()
+    assert len(registry._instances) == before
+
+
 @pytest.fixture(scope="module")
 def lab(folder):
     """Start a JupyterLab and return its address."""

@@ -5,8 +5,6 @@ import pytest
 import xarray as xr
 
 pytest.importorskip("anywidget")
-from ipywidgets.widgets import widget as registry  # the open widgets are counted in it
-
 from s4a import compare, synthetic
 from s4a.method.register import log_area_ratio
 from s4a.show.draw import position_colors
@@ -32,17 +30,8 @@ def comparison():
 
 
 @pytest.fixture
-def panel(comparison):
-    before, made = len(registry._instances), []
-
-    def make(**options):
-        made.append(Comparison(comparison, **options))
-        return made[-1]
-
-    yield make
-    for widget in made:
-        widget.close()
-    assert len(registry._instances) == before
+def panel(comparison, closed_later):
+    return lambda **options: closed_later(Comparison, comparison, **options)
 
 
 def floats(data):
@@ -110,21 +99,10 @@ def test_errors_have_one_scale_and_the_mean_is_shown(comparison, panel):
     shown.colors.value = "error"
     bars = [scene.bar for scene in shown.scenes[1:]]
     assert bars[0] == bars[1] == bars[2]
-    mean = (
-        100
-        * comparison["metrics/euclidean_error"]
-        .sel(algorithm="registered surface", pair="brain_02")
-        .item()
-    )
-    assert shown.scenes[2].title == f"registered surface, error {mean:.2f} %"
-    shown.pair.value = "brain_03"
-    mean = (
-        100
-        * comparison["metrics/euclidean_error"]
-        .sel(algorithm="registered surface", pair="brain_03")
-        .item()
-    )
-    assert shown.scenes[2].title == f"registered surface, error {mean:.2f} %"
+    errors = 100 * comparison["metrics/euclidean_error"].sel(algorithm="registered surface")
+    for shown.pair.value in ("brain_02", "brain_03"):
+        mean = errors.sel(pair=shown.pair.value).item()
+        assert shown.scenes[2].title == f"registered surface, error {mean:.2f} %"
     shown.colors.value = "area"
     assert shown.scenes[1].bar["high"] == 2
     assert shown.message.value == ""

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("anywidget")
-from ipywidgets.widgets import widget as registry  # the open widgets are counted in it
-
 from s4a import statistics
 from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
 from s4a.schema import dataset
@@ -25,17 +23,8 @@ def result(study):
 
 
 @pytest.fixture
-def panel(study, result):
-    before, made = len(registry._instances), []
-
-    def make(values=result, **options):
-        made.append(Maps(study, values, **options))
-        return made[-1]
-
-    yield make
-    for widget in made:
-        widget.close()
-    assert len(registry._instances) == before
+def panel(study, result, closed_later):
+    return lambda values=result, **options: closed_later(Maps, study, values, **options)
 
 
 def test_it_is_grey_where_it_is_not_significant_and_shows_the_significant_share(

@@ -50,18 +50,9 @@ from s4a.widgets.views import Scene
 
 
 @pytest.fixture
-def panel(study):
-    """Make a panel that is closed after the test, when nothing of it may be left."""
-    before, made = len(registry._instances), []
-
-    def make(kind, **options):
-        made.append(kind(study, **options))
-        return made[-1]
-
-    yield make
-    for widget in made:
-        widget.close()
-    assert len(registry._instances) == before
+def panel(study, closed_later):
+    """Make a panel of the study."""
+    return lambda kind, **options: closed_later(kind, study, **options)
 
 
 def floats(data, columns=3):
