@@ -46,7 +46,6 @@ PAGES = (
 SPEED = (
     ("scale.py", "start"),
     ("scale.py", "open", "400"),
-    ("scale.py", "left_out", "200"),
     ("speed.py", "nearest"),
     ("speed.py", "stages"),
     ("speed.py", "growth"),
