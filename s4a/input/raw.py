@@ -11,6 +11,7 @@ import math
 import os
 import re
 import stat
+import warnings
 import xml.etree.ElementTree as ElementTree
 import zipfile
 import zlib
@@ -332,7 +333,8 @@ def npy(data: bytes) -> np.ndarray:
     file, npy_format = io.BytesIO(data), np.lib.format
     is_first = npy_format.read_magic(file) == (1, 0)
     read = npy_format.read_array_header_1_0 if is_first else npy_format.read_array_header_2_0
-    shape, by_column, dtype = read(file)
+    with warnings.catch_warnings(action="ignore"):  # of headers that Python 2 wrote
+        shape, by_column, dtype = read(file)
     if dtype.kind not in "biufU":
         raise ValueError(
             f"an array of numbers or text, without pickled objects, expected; found {dtype}"
