@@ -46,6 +46,7 @@ PAGES = (
 SPEED = (
     ("scale.py", "start"),
     ("scale.py", "open", "400"),
+    ("scale.py", "left_out", "200"),
     ("speed.py", "nearest"),
     ("speed.py", "stages"),
     ("speed.py", "growth"),
