@@ -1,8 +1,9 @@
 """How S4A starts, and how its steps grow with the number of shapes.
 
 ``scale.py start`` measures processes from their first moment on: CPU seconds, the least of five,
-and peak memory.  ``scale.py open 1000`` opens a study of so many small shapes, ``scale.py growth 50
-100 200 400`` analyses so many tiny ones and fits the exponents of every stage.
+and peak memory.  ``scale.py left_out 800`` computes leave-one-out of so many shapes in both ways,
+``scale.py open 1000`` opens a study of so many small shapes, ``scale.py growth 50 100 200 400``
+analyses so many tiny ones and fits the exponents of every stage.
 """
 
 import contextlib
@@ -21,6 +22,7 @@ import numpy as np
 
 import s4a
 from s4a import synthetic
+from s4a.analysis import model
 from s4a.study import netcdf, store
 from s4a.study.runner import Run
 
@@ -79,6 +81,25 @@ def start():
     for name, arguments in STARTS.items():
         cpu, wall, memory = map(min, zip(*(cost(arguments) for _ in range(5)), strict=True))
         say(f"{name:28} {cpu:8.2f} {wall:8.2f} {memory:8.0f}")
+
+
+def left_out(*sizes):
+    """Leave-one-out: the components of all shapes but one from those of all, and each again."""
+    say(f"\n{'shapes':>8} {'CPU s':>8} {'again':>8} {'largest difference of the errors':>36}")
+    for s in sizes or (100, 200, 400):
+        x = np.random.default_rng(0).normal(size=(s, 2000)) * np.linspace(1, 0.01, 2000)
+        K = x @ x.T
+        begin = time.process_time()
+        error, _ = model.leave_one_out(K)
+        between = time.process_time()
+        again = []
+        for i in range(s):
+            others = np.delete(np.arange(s), i)
+            rows = K[np.ix_(others, others)], K[i, others], K[i, i]
+            again.append(model.describe_by_others(*rows)[0])
+        spent = between - begin, time.process_time() - between
+        gap = np.abs(error - again).max() / error.max()
+        say(f"{s:8} {spent[0]:8.2f} {spent[1]:8.2f} {gap:36.1e}")
 
 
 def study_of(n, folder):
@@ -161,7 +182,7 @@ def growth(*sizes):
         say(f"{stage:32} {' '.join(f'{s:8.2f}' for s in seconds)}   exponent {slope:5.2f}")
 
 
-PARTS = {"start": start, "open": opening, "growth": growth}
+PARTS = {"start": start, "left_out": left_out, "open": opening, "growth": growth}
 
 if __name__ == "__main__":
     part, *words = sys.argv[1:] or [""]

@@ -7,18 +7,17 @@ correspondences and alignment depend on all shapes; a left-out shape is left out
 as the attribute ``correspondence`` records.
 """
 
-from collections.abc import Iterator
-
 import numpy as np
 import xarray as xr
 from scipy import stats
+from scipy.linalg.lapack import dlasd4
 
 from s4a.analysis.inputs import displacements_of
 from s4a.analysis.permutation import check_permutations
 from s4a.geometry.closest import distance_to_surface
 from s4a.geometry.mesh import as_arrays
 from s4a.method.deform import smoother
-from s4a.method.pca import gram, principal_components, synthesize
+from s4a.method.pca import center_gram, gram, principal_components, synthesize
 from s4a.method.shape import Shape
 from s4a.schema import Array, check_count, check_type, dataset, in_unit, unit_of
 from s4a.seeds import RNG, seed_of
@@ -67,26 +66,90 @@ def describe_by_others(
     )
 
 
-def leave_one_out(K: Array) -> Iterator[tuple[Array, Array, Array, Array]]:
-    """Reconstruct every field by the model of all others.
+def leave_one_out(K: Array) -> tuple[Array, Array]:
+    """Reconstruct every field by the model of all others, see :func:`describe_by_others`.
 
-    A model takes the eigenvectors of all others, O(s^3) for each of s fields.
+    The scatter of the others is a rank-one downdate of that of all, S - s / (s - 1) x x^T with the
+    centred field x.  Its components are updated in O(s^2) for each field (Golub 1973).
 
     Parameters
     ----------
     K : float ndarray (s, s)
         Gram matrix of :func:`s4a.method.pca.gram`.
 
-    Yields
-    ------
-    others : int ndarray (s - 1,)
-        Rows of the others.
-    error, score, steps
-        As returned by :func:`describe_by_others`.
+    Returns
+    -------
+    error : float ndarray (s, s - 1)
+        Vertex distance after reconstruction with 0, 1, ... s - 2 components.
+    score : float ndarray (s, s - 2)
+        Absolute scores in standard deviations of the model of the others.
     """
-    for i in range(len(K)):
-        others = np.delete(np.arange(len(K)), i)
-        yield others, *describe_by_others(K[np.ix_(others, others)], K[i, others], K[i, i])
+    s = len(K)
+    centred = center_gram(K)
+    variance, V = principal_components(centred)
+    scatter = variance * (s - 1)
+    ratio = s / (s - 1)  # deviation from the mean of the others by that from the mean of all
+    error, score = np.zeros((s, s - 1)), np.full((s, s - 2), np.nan)
+    if not len(scatter):  # equal fields
+        return error, score
+    for i in range(s):
+        eigenvalue, coefficient = downdate(scatter, V[i] * np.sqrt(scatter), ratio)
+        least = max(1e-12 * eigenvalue[0], s * np.finfo(float).eps * scatter[0])
+        n = min((eigenvalue > least).sum(), s - 2)
+        eigenvalue, coefficient = eigenvalue[:n], coefficient[:n]
+        explained = np.concatenate([[0], np.cumsum(coefficient**2)])
+        residual = np.sqrt(np.maximum(ratio**2 * centred[i, i] - explained, 0))
+        error[i] = np.pad(residual, (0, s - 1 - len(residual)), mode="edge")
+        score[i, :n] = coefficient / np.sqrt(eigenvalue / (s - 2))
+    return error, score
+
+
+def downdate(d: Array, z: Array, rho: float) -> tuple[Array, Array]:
+    """Return the eigenvalues of diag(d) - rho z z^T, and |rho z| along each eigenvector.
+
+    Parameters
+    ----------
+    d : float ndarray (c,)
+        Positive, descending.
+    z : float ndarray (c,)
+    rho : float
+        Positive; the matrix must be semi-definite up to rounding.
+
+    Returns
+    -------
+    eigenvalue : float ndarray (c,)
+        Descending.
+    along : float ndarray (c,)
+        Not negative.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.analysis.model import downdate
+    >>> eigenvalue, along = downdate(np.array([3.0, 2.0]), np.array([1.0, 0.0]), 0.5)
+    >>> eigenvalue.round(6).tolist(), along.round(6).tolist()
+    ([2.5, 2.0], [0.5, 0.0])
+    """
+    # deflation of equal eigenvalues and of zero entries of z (Dongarra & Sorensen 1987)
+    least = 8 * np.finfo(float).eps * d[0]
+    group = np.cumsum(np.r_[False, d[:-1] - d[1:] > least])
+    w = np.zeros(len(d))
+    w[np.unique(group, return_index=True)[1]] = rho * np.bincount(group, z**2)
+    changes = np.sqrt(w * w.sum()) > least
+    eigenvalue, along = d.copy(), np.zeros(len(d))
+    if changes.any():
+        w, far = w[changes], np.sqrt(d[changes][0] - d[changes])
+        size = w.sum()
+        # LAPACK has the eigenvalues root^2 of far^2 + size z z^T; difference is far - root
+        found = (dlasd4(j, far, np.sqrt(w / size), size) for j in range(len(far)))
+        difference, root, total, failed = map(np.array, zip(*found, strict=True))
+        if failed.any():
+            raise ArithmeticError(f"{failed.sum()} of {len(far)} eigenvalues were not found")
+        gap = difference * total if len(far) > 1 else -size
+        eigenvalue[changes] = d[changes][0] - root**2
+        along[changes] = np.sqrt(rho / (w / gap**2).sum(-1))
+    order = np.argsort(-eigenvalue, kind="stable")
+    return eigenvalue[order], along[order]
 
 
 def specificity(K: Array, n_samples: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
@@ -287,56 +350,58 @@ def evaluate(
     s = len(d)
     generator = np.random.default_rng(seed_of(seed, rng))
     K = gram(d - d.mean(0), area)
+    error, _ = leave_one_out(K)
     distance, nearest, score = specificity(K, n_samples, generator)
-    points = draw_points(area, n_points, generator)
-    P = registration["position"].values[points] + d[:, points]  # (s, p, 3)
-    X, T = as_arrays(registration)
-    rows, rows_of_surfaces = [], []
-    for others, error_of_shape, _, steps in leave_one_out(K):
-        if n_points:
-            surface = X + d[len(rows)], T
-            rows_of_surfaces.append(surface_error(P[others], steps, *surface)[1:])
-        rows.append(error_of_shape)
-    error = np.stack(rows)  # (s, s - 1)
-    variance, V = principal_components(K)
+    variance, _ = principal_components(K)
     c = len(variance)
     compactness = np.cumsum(variance)
     quality = dataset(
         {"correspondence": KEPT, "shapes": s, "generalization_0": float(error[:, 0].mean())},
         compactness=compactness,
         compactness_error=np.sqrt(2 / s) * compactness,
-        **_means("generalization", error[:, 1:], c),
-        **_means("specificity", distance.T, c),
+        generalization=_per_component(error[:, 1:].mean(0), c),
+        generalization_error=_per_component(stats.sem(error[:, 1:]), c),
+        specificity=distance.mean(1),
+        specificity_error=stats.sem(distance, axis=1),
     )
     if n_points:
+        points = draw_points(area, n_points, generator)
+        P = registration["position"].values[points] + d[:, points]  # (s, p, 3)
         samples = score[:n_surface], nearest[:, :n_surface]
-        to_surfaces = _distances_of_samples(P, V, *samples, X, T, d)
-        of_surfaces = _means("generalization_surface", np.stack(rows_of_surfaces), c)
-        of_samples = _means("specificity_surface", to_surfaces.T, c)
-        quality = quality.merge(dataset(None, **of_surfaces, **of_samples))
+        quality = quality.merge(_measure_surfaces(registration, d, K, P, *samples))
     quality = in_unit(quality, unit_of(registration["displacement"]))
     features = _coefficients(study, d, area)
     return quality.merge(_compare_with_chance(features, c, n_permutations, generator))
 
 
-def _means(name, values, c):
-    """Means of the rows ``(r, ...)`` for 1, 2, ... components ``(c,)``, and standard errors.
-
-    NaN stands for components that the models of left-out shapes do not have.
-    """
-    means = {name: values.mean(0), f"{name}_error": stats.sem(values)}
-    return {n: np.pad(v, (0, c), constant_values=np.nan)[:c] for n, v in means.items()}
+def _per_component(values, c):
+    """Values for 1, 2, ... components ``(c,)``, NaN beyond the components of left-out models."""
+    return np.pad(values, (0, c), constant_values=np.nan)[:c]
 
 
-def _distances_of_samples(P, V, score, nearest, X, T, d):
-    """Mean distances ``(c, n_samples)`` of points P ``(s, p, 3)`` of samples to nearest shapes."""
-    modes = np.einsum("sc,spx->cpx", V, P - P.mean(0)) / np.sqrt(len(P) - 1)
+def _measure_surfaces(registration, d, K, P, score, nearest):
+    """Generalization and specificity as mean distances of points P ``(s, p, 3)`` to surfaces."""
+    X, T = as_arrays(registration)
+    _, V = principal_components(K)
+    c = V.shape[1]
+    rows = []
+    for i in range(len(d)):
+        others = np.delete(np.arange(len(d)), i)
+        *_, steps = describe_by_others(K[np.ix_(others, others)], K[i, others], K[i, i])
+        rows.append(surface_error(P[others], steps, X + d[i], T))
+    error = np.stack(rows)  # (s, s - 1)
+    modes = np.einsum("sc,spx->cpx", V, P - P.mean(0)) / np.sqrt(len(d) - 1)
     samples = P.mean(0) + np.cumsum(score[:, :, None, None] * modes, axis=1)  # (n_samples, c, p, 3)
-    distance = np.zeros(nearest.shape)
+    distance = np.zeros(nearest.shape)  # (c, n_samples)
     for i in np.unique(nearest):
         component, sample = np.nonzero(nearest == i)
         distance[component, sample] = mean_distance(samples[sample, component], X + d[i], T)
-    return distance
+    return dataset(
+        generalization_surface=_per_component(error[:, 1:].mean(0), c),
+        generalization_surface_error=_per_component(stats.sem(error[:, 1:]), c),
+        specificity_surface=distance.mean(1),
+        specificity_surface_error=stats.sem(distance, axis=1),
+    )
 
 
 def _compare_with_chance(features, c, n_permutations, rng):

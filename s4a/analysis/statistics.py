@@ -601,9 +601,9 @@ def outliers(
     K = gram(d - d.mean(0), area)
     variance, _ = principal_components(K)
     c = count_components(variance, s, n_components, most=s - 3, at_most=s // 10)
-    left_out = [(error[c], score[:c]) for _, error, score, _ in leave_one_out(K)]
-    error, score = map(np.array, zip(*left_out, strict=True))
-    squared = np.nansum(score**2, axis=1)
+    error, score = leave_one_out(K)
+    error = error[:, c]
+    squared = np.nansum(score[:, :c] ** 2, axis=1)
     n = s - 1
     p = stats.f.sf(squared * n * (n - c) / (c * (n * n - 1)), c, n - c)
     deviation = stats.median_abs_deviation(error, scale="normal")
