@@ -207,10 +207,7 @@ def pictured(scene):
         size=(int(scene.width), int(scene.height)),
     )
     address = data_uri(image_bytes(on_white(pixels), "png"), "image/png")
-    bars = [
-        PARTS.color_bar(bar["colors"], f"{bar['low']:.2g}", f"{bar['high']:.2g}", bar["label"])
-        for bar in (part.bar for part in parts if hasattr(part, "bar"))
-    ]
+    bars = [PARTS.color_bar(bar) for bar in (part.bar for part in parts if hasattr(part, "bar"))]
     return (
         f'<figure style="margin: 0"><img alt="A scene" src="{address}">{"".join(bars)}'
         "<figcaption>A picture: the scene itself turns in the notebook.</figcaption></figure>"

@@ -11,7 +11,7 @@ import logging
 import re
 import sys
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from typing import Any, NoReturn
 
@@ -129,18 +129,10 @@ def as_flags(message: str, flags: Iterable[str]) -> str:
     return re.sub(pattern, flag_of, message)
 
 
-class Once(logging.Filter):
-    """Filter that passes every message once: several steps of a command may find the same."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen: set[str] = set()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether the message is new."""
-        before = len(self.seen)
-        self.seen.add(record.getMessage())
-        return len(self.seen) > before
+def once() -> Callable[[logging.LogRecord], bool]:
+    """Return a filter that passes every message once: several steps may find the same."""
+    seen: dict[str, logging.LogRecord] = {}
+    return lambda record: seen.setdefault(record.getMessage(), record) is record
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -160,9 +152,9 @@ def main(arguments: list[str] | None = None) -> int:
 
     stages = logging.getLogger("s4a.study.runner")
     before = stages.level
-    filters = [(handler, Once()) for handler in logging.getLogger().handlers]
-    for handler, once in filters:
-        handler.addFilter(once)
+    filters = [(handler, once()) for handler in logging.getLogger().handlers]
+    for handler, is_new in filters:
+        handler.addFilter(is_new)
     try:
         if args.quiet:
             logging.disable(logging.WARNING)
@@ -183,5 +175,5 @@ def main(arguments: list[str] | None = None) -> int:
     finally:
         logging.disable(logging.NOTSET)
         stages.setLevel(before)
-        for handler, once in filters:
-            handler.removeFilter(once)
+        for handler, is_new in filters:
+            handler.removeFilter(is_new)

@@ -74,9 +74,8 @@ def examine(folder: Path | str = ".") -> list[Finding]:
     found += [*dependencies(), writable("study folder", Path(folder), "another --out")]
     temporary = Path(tempfile.gettempdir())
     found += [writable("temporary folder", temporary, "export TMPDIR=FOLDER")]
-    for check in (memory, threads):
-        with contextlib.suppress(ImportError):  # packages that do not import are reported above
-            found.append(check())
+    with contextlib.suppress(ImportError):  # packages that do not import are reported above
+        found.append(memory())
     return [*found, *extras()]
 
 
@@ -178,21 +177,6 @@ def memory() -> Finding:
     text = f"{free:.1f} GiB free"
     few = f"{text}; {LEAST_MEMORY:.0f} is little for large meshes"
     return noted("memory", free >= LEAST_MEMORY, text, few, "--n-jobs 1, or close other programs")
-
-
-def threads() -> Finding:
-    """Return the linear algebra libraries and their numbers of threads."""
-    import numpy as np
-    import scipy.linalg  # loads its own
-    from threadpoolctl import threadpool_info
-
-    np.linalg.inv(np.eye(2))
-    scipy.linalg.inv(np.eye(2))
-    text = ", ".join(
-        " ".join(f"{pool['internal_api']} {pool['version'] or ''} of {pool['num_threads']}".split())
-        for pool in threadpool_info()
-    )
-    return Finding("threads", "ok", f"{text}; workers of a run use one each")
 
 
 def extras() -> Iterator[Finding]:

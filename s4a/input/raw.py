@@ -11,6 +11,7 @@ import math
 import os
 import re
 import stat
+import warnings
 import xml.etree.ElementTree as ElementTree
 import zipfile
 import zlib
@@ -316,12 +317,6 @@ def _read_member(archive, member):
         return npy(stream.read(member.file_size))  # no more, even if the size is wrong
 
 
-NPY = re.compile(
-    rb"\{ *'descr': *'([<>|=]?[biufU]\d{1,9})', *'fortran_order': *(True|False), *"
-    rb"'shape': *\(([\d, ]{0,400})\),? *\}\s*"
-)
-
-
 def npy(data: bytes) -> np.ndarray:
     """Read an NPY file of numbers or text, without evaluating or unpickling anything.
 
@@ -335,21 +330,17 @@ def npy(data: bytes) -> np.ndarray:
     >>> npy(out.getvalue()).tolist()
     [[1, 2], [3, 4]]
     """
-    if not data.startswith(b"\x93NUMPY") or data[6:8] not in (b"\1\0", b"\2\0"):
-        raise ValueError("an array in NumPy's format 1.0 or 2.0 expected")
-    width = 2 * data[6]
-    start = 8 + width + int.from_bytes(data[8 : 8 + width], "little")
-    header = NPY.fullmatch(data, 8 + width, start)
-    if not header:
-        text = data[8 + width : start].strip()[:100]
+    file, npy_format = io.BytesIO(data), np.lib.format
+    is_first = npy_format.read_magic(file) == (1, 0)
+    read = npy_format.read_array_header_1_0 if is_first else npy_format.read_array_header_2_0
+    with warnings.catch_warnings(action="ignore"):  # of headers that Python 2 wrote
+        shape, by_column, dtype = read(file)
+    if dtype.kind not in "biufU":
         raise ValueError(
-            "an array of numbers or text, without pickled objects, expected; "
-            f"found the header {text!r}"
+            f"an array of numbers or text, without pickled objects, expected; found {dtype}"
         )
-    dtype = np.dtype(header[1].decode())
-    shape = tuple(int(size) for size in header[3].split(b",") if size.strip())
-    needed, left = math.prod(shape) * dtype.itemsize, len(data) - start
-    if dtype.itemsize == 0 or needed > left:
+    needed, left = math.prod(shape) * dtype.itemsize, len(data) - file.tell()
+    if not dtype.itemsize or min(shape, default=0) < 0 or needed > left:
         raise ValueError(f"{needed} bytes of {dtype} expected for the shape {shape}, found {left}")
-    values = np.frombuffer(data, dtype, math.prod(shape), start)
-    return values.reshape(shape, order="F" if header[2] == b"True" else "C").copy()
+    values = np.frombuffer(data, dtype, math.prod(shape), file.tell())
+    return values.reshape(shape, order="F" if by_column else "C").copy()

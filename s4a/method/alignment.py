@@ -7,7 +7,7 @@ pose of the files is used where ICP from it fits nearly as well and rotates the 
 """
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -156,16 +156,11 @@ def align_onto(
 
 def ambiguity_of_reference(target: Basis, voters: Voters) -> Alignment:
     """Find poses in which the reference itself fits the other shapes equally well."""
-    other, onto = next(iter(voters.values()))
+    other, (S, u) = next(iter(voters.values()))
     if from_landmarks(target, other):
         return Alignment(*IDENTITY)
-    found = [_after((R, t), onto) for R, t, _ in poses(target.cloud, other.cloud)[:N_POSES]]
+    found = [(S @ R, S @ t + u) for R, t, _ in poses(target.cloud, other.cloud)[:N_POSES]]
     return elect(target, voters, found)._replace(R=np.eye(3), t=np.zeros(3))
-
-
-def _after(first: RigidTransform, second: RigidTransform) -> RigidTransform:
-    (R, t), (S, u) = first, second
-    return S @ R, S @ t + u
 
 
 def elect(source: Basis, voters: Voters, found: Sequence[RigidTransform]) -> Alignment:
@@ -252,11 +247,8 @@ def align_voted(
     name: str, basis: Basis, target: Basis, reference: str, alignment: str, voters: Voters
 ) -> Alignment:
     """Align a shape of a network with the votes of other shapes."""
-    others = dict(itertools.islice(_without(voters, name), N_VOTERS))
+    others = {other: voter for other, voter in voters.items() if other != name}
+    others = dict(itertools.islice(others.items(), N_VOTERS))
     if name != reference:
         return align_onto(basis, target, alignment, others)
     return ambiguity_of_reference(basis, others) if others else Alignment(*IDENTITY)
-
-
-def _without(voters: Voters, name: str) -> Iterable[tuple[str, tuple[Basis, RigidTransform]]]:
-    return ((other, voter) for other, voter in voters.items() if other != name)

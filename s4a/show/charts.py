@@ -10,7 +10,7 @@ import xarray as xr
 from matplotlib import rc_context
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Colormap, LogNorm, Normalize
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator, PercentFormatter
@@ -424,19 +424,4 @@ def scores(
         ax.set(xlabel=f"PC{a + 1} (sd)", ylabel=f"PC{b + 1} (sd)")
         ax.margins(0.12)
     _write_names(figure, axes, [score[:, plane] for plane in planes], names)
-    return figure
-
-
-def color_bar(colormap: str | Colormap, low: float, high: float, label: str) -> Figure:
-    """Draw a horizontal colour bar.
-
-    Examples
-    --------
-    >>> from s4a.show.charts import color_bar
-    >>> color_bar("viridis", 0, 3, "distance (mm)")
-    <Figure ...>
-    """
-    figure, ((ax,),) = _figure(4.2, 0.62)
-    scale = ScalarMappable(Normalize(low, high), colormap)
-    figure.colorbar(scale, cax=ax, orientation="horizontal", label=label)
     return figure

@@ -11,7 +11,7 @@ from s4a.input.plausibility import decisions, notices
 from s4a.options import kept_options
 from s4a.schema import check_type
 from s4a.show import charts
-from s4a.show.browser import MODES, PARTS, TEMPLATES, appearance_state, mesh_state, webp_uri
+from s4a.show.browser import MODES, PARTS, TEMPLATES, appearance_state, color_scale, mesh_state
 from s4a.show.draw import SIGNED, Viewpoint, opposite, position_colors, ramp_colors, render
 from s4a.show.pictures import N_MODES, PANEL, SIGMA, mode_pictures, shared_frames
 from s4a.show.surfaces import (
@@ -32,7 +32,7 @@ from s4a.show.surfaces import (
 )
 from s4a.study.tree import left_out, seconds_of
 
-LARGE = 20_000  # vertices above which a page deforms the low-resolution mesh, in larger steps
+LARGE = 20_000  # vertices above which a page deforms the low-resolution mesh
 N_TRANSFERRED = 5  # shapes to which the template's colours are transferred
 
 
@@ -242,43 +242,29 @@ def _distances(study, camera):
     return note + PARTS.drawing(figure, "the shapes ranked by their distance to the limit shape")
 
 
-def _sliders(study, camera):
-    """Return sliders that deform the mean shape, with precomputed pictures as a fallback."""
-    n_frames = 13 if study["registration"].sizes["vertex"] <= LARGE else 7
-    sigmas, ratio = np.linspace(-SIGMA, SIGMA, n_frames).tolist(), _ratio(study)
-    sliders = []
-    for mode, drawn in enumerate(mode_pictures(study, sigmas, len(ratio), **camera)):
-        frames, labels = list(map(webp_uri, drawn)), [_label(mode, s) for s in sigmas]
-        sliders.append(PARTS.slider(mode, frames, labels, f"{ratio[mode]:.1%} of the variance"))
-    return _live_modes(study, PARTS.grid(sliders), camera)
-
-
 def _ratio(study):
     """Return the explained variance ratios of the modes that are drawn."""
     return study["pca"]["explained_variance_ratio"].values[:N_MODES]
 
 
-def _label(mode, sigma):
-    amount = f"{sigma:+.3g} σ".replace("-", "−") if sigma else "mean"
-    return f"mode {mode + 1}, {amount}"
-
-
 def _modes(study, camera):
     limit, unit = mode_limits(study)[0], study["pca"]["deformation"].attrs.get("units", "")
-    scores, n_modes, pictures = (-SIGMA, 0, SIGMA), len(_ratio(study)), []
-    behind = mode_pictures(study, [SIGMA], n_modes, **camera | {"view": opposite(camera["view"])})
-    for mode, drawn in enumerate(mode_pictures(study, scores, n_modes, **camera)):
-        texts = [_label(mode, score) for score in scores]
-        pictures += map(PARTS.picture, drawn, texts)
-        pictures.append(PARTS.picture(behind[mode][0], f"{texts[-1]}, from behind"))
+    ratio, pictures = _ratio(study), []
+    behind = mode_pictures(
+        study, [SIGMA], len(ratio), **camera | {"view": opposite(camera["view"])}
+    )
+    for mode, drawn in enumerate(mode_pictures(study, (-SIGMA, 0, SIGMA), len(ratio), **camera)):
+        scores = f"−{SIGMA} σ", "mean", f"+{SIGMA} σ", f"+{SIGMA} σ, from behind"
+        texts = [f"mode {mode + 1}, {score}" for score in scores]
+        texts[1] += f", {ratio[mode]:.1%} of the variance"
+        pictures += map(PARTS.picture, [*drawn, *behind[mode]], texts)
     note = "Blue is expansion and red is compression relative to the mean, on the colour scale of "
     note += "the sliders. Larger displacements have the colours at the ends."
-    bar = charts.color_bar(SIGNED, -limit, limit, f"displacement along the normal ({unit})")
-    grid = PARTS.grid(pictures, "row four")
-    return PARTS.note(note) + grid + PARTS.drawing(bar, "colour bar")
+    bar = color_scale(SIGNED, -limit, limit, f"displacement along the normal ({unit})")
+    return PARTS.note(note) + PARTS.grid(pictures, "row four") + PARTS.color_bar(bar)
 
 
-def _live_modes(study, fallback, camera):
+def _sliders(study, camera):
     """Return sliders that deform the mean shape in the browser, at low resolution if large."""
     coarse = template_coarse(study)
     if study["registration"].sizes["vertex"] <= LARGE:
@@ -301,7 +287,7 @@ def _live_modes(study, fallback, camera):
     size = f"{len(mean):,} vertices" + ("" if coarse is None else ", low resolution")
     if study["pca"].sizes["component"] > N_LIVE:
         size += f", the first {N_LIVE} modes"
-    return PARTS.modes(state, MODES, size, fallback)
+    return PARTS.modes(state, MODES, size)
 
 
 def _variance(study, camera):
@@ -378,8 +364,8 @@ def _confidence(study, camera):
     note = "Mean confidence on the template, the two shapes with the lowest confidence, and the "
     note += "distortion by the registration. Among shapes in similar poses the confidence is an "
     note += "average of the group and does not rank the points by their error."
-    bar = charts.color_bar("viridis", 0, 1, "confidence")
-    return PARTS.note(note) + PARTS.grid(figures) + PARTS.drawing(bar, "colour bar")
+    bar = PARTS.color_bar(color_scale("viridis", 0, 1, "confidence"))
+    return PARTS.note(note) + PARTS.grid(figures) + bar
 
 
 def _resources(study, camera):

@@ -1,4 +1,4 @@
-"""Pictures and films of modes of variation (6.1, Fig. 4), a mesh or a panel as files."""
+"""Pictures and films of modes of variation (6.1, Fig. 4) or a mesh as files."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -49,7 +49,7 @@ def mode_pictures(
     (:func:`s4a.show.surfaces.mode_limits`).
     """
     draw = _modes(study, np.arange(1, 1 + n_modes), view, up)
-    frame = _frames([draw((-SIGMA, SIGMA))], True)[0]
+    frame = _frame([draw((-SIGMA, SIGMA))])
     options = {"view": "top", "size": size, "frame": frame}
     pictures: list[Array] = []
     for i, cell in enumerate(draw(scores)):
@@ -85,13 +85,13 @@ def write_picture(
     width: int = 1200,
     transparent: bool = False,
 ) -> Path:
-    """Write modes of variation, a mesh or a panel as a PNG picture with titles and colour bar.
+    """Write modes of variation or a mesh as a PNG picture with titles and colour bar.
 
     Parameters
     ----------
-    data : xarray.DataTree, xarray.Dataset or panel
-        A study with ``/registration`` and ``/pca``; a mesh; or a panel of :mod:`s4a.widgets`, whose
-        surfaces are drawn side by side in their initial view.
+    data : xarray.DataTree or xarray.Dataset
+        A study with ``/registration`` and ``/pca``, or a mesh.  *Save picture* of a panel of
+        :mod:`s4a.widgets` writes the panel as it is shown.
     path : str or Path
         File with the suffix ``.png``.
     mode : int or sequence of int
@@ -137,12 +137,11 @@ def write_picture(
     'mode_1.png'
     """
     path = _checked(path, (".png",), width)
-    draw, _, shared = _source(data, mode, values, label, view, up)
+    draw = _source(data, mode, values, label, view, up)
     scores = _numbers("score", score)
     cells = draw(scores)
-    columns = len(scores) if shared else len(cells)
-    frames = _frames([cells], shared)
-    _compose(cells, frames, columns, width, title, transparent).save(path)
+    columns = min(len(scores), len(cells))
+    _compose(cells, _frame([cells]), columns, width, title, transparent).save(path)
     return path
 
 
@@ -167,9 +166,9 @@ def write_film(
 
     Parameters
     ----------
-    data : xarray.DataTree, xarray.Dataset or panel
+    data : xarray.DataTree or xarray.Dataset
         As for :func:`s4a.write_picture`.  A study of a regression
-        (:func:`s4a.analysis.statistics.regression_modes`) has one mode.  A mesh and a panel need
+        (:func:`s4a.analysis.statistics.regression_modes`) has one mode.  A mesh needs
         ``turn=True``.
     path : str or Path
         File with the suffix ``.gif``, ``.webp`` or ``.apng``.  *Save film* of the panels writes
@@ -216,7 +215,8 @@ def write_film(
     'mode_1.gif'
     """
     path = _checked(path, FILMS, width)
-    draw, axis, shared = _source(data, mode, values, label, view, up)
+    draw = _source(data, mode, values, label, view, up)
+    axis = rotation(view, up)[:, "xyz".index(up)]
     check_count("n_frames", n_frames, 2, 10_000)
     for name, given, more in (
         ("score", score, ""),
@@ -225,11 +225,8 @@ def write_film(
     ):
         if _numbers(name, given).size > 1 or (more and given < 0.01 * n_frames):
             raise ValueError(f"{name} needs one number{more}, found {given!r}")
-    if not (turn or shared):
-        raise ValueError(
-            f"a study with modes of variation is needed, found {type(data).__name__}; "
-            "for a mesh or a panel give turn=True"
-        )
+    if not turn and isinstance(data, xr.Dataset):
+        raise ValueError("a study with modes of variation is needed; for a mesh give turn=True")
 
     def cells(i):
         angle = 2 * np.pi * i / n_frames
@@ -237,9 +234,9 @@ def write_film(
             return draw(np.array([-reach * np.cos(angle)]))
         return [_rotated(cell, axis, angle) for cell in draw(np.array([score]))]
 
-    frames = _frames(map(cells, range(n_frames)), shared)
+    frame = _frame(map(cells, range(n_frames)))
     pictures = [
-        _compose(drawn, frames, len(drawn), width, title, False).convert("RGB")
+        _compose(drawn, frame, len(drawn), width, title, False).convert("RGB")
         for drawn in map(cells, range(n_frames))
     ]
     if path.suffix.lower() == ".gif":
@@ -288,25 +285,19 @@ def _few_colors(pictures: list[Image.Image]) -> list[Image.Image]:
 
 
 def _source(data, mode, values, label, view, up):
-    """Return a function scores -> cells, the rotation axis, and True if cells share a frame."""
-    R = rotation(view, up)
-    axis = R[:, "xyz".index(up)]
+    """Return a function scores -> cells."""
     if isinstance(data, xr.DataTree) and {"registration", "pca"} <= set(data.children):
-        return _modes(data, mode, view, up), axis, True
-    cells = []
-    if isinstance(data, xr.Dataset) and "corner_vertex" in data:
-        X, T = as_arrays(data)
-        if values is not None:
-            check_rows("values", values, (len(X),), (len(X), 3))
-        cells.append(Cell("", X @ R.T, T, *_value_colors(values, label)))
-    elif hasattr(data, "comm"):  # a widget
-        cells, axis = list(_views(data)), np.array([0.0, 1, 0])
-    if not cells:
+        return _modes(data, mode, view, up)
+    if not (isinstance(data, xr.Dataset) and "corner_vertex" in data):
         raise ValueError(
-            f"a study with /registration and /pca, a mesh or a panel with a surface is needed, "
-            f"found {type(data).__name__}"
+            f"a study with /registration and /pca, or a mesh, is needed, found "
+            f"{type(data).__name__}; a panel has the buttons Save picture and Save film"
         )
-    return lambda scores: cells, axis, False
+    X, T = as_arrays(data)
+    if values is not None:
+        check_rows("values", values, (len(X),), (len(X), 3))
+    cell = Cell("", X @ rotation(view, up).T, T, *_value_colors(values, label))
+    return lambda scores: [cell]
 
 
 def _modes(study, mode, view, up):
@@ -326,15 +317,12 @@ def _modes(study, mode, view, up):
     bar = appearance_state(limits, unit, view, up)["bars"]["normal"]
 
     def cell(m, s):
-        title = f"mode {m} ({100 * share[m - 1]:.0f} %), {_sigmas(s)}" if s else "mean"
+        sigmas = f"{round(s, 1) + 0.0:+.1f} σ".replace("-", "−")  # no minus before 0.0
+        title = f"mode {m} ({100 * share[m - 1]:.0f} %), {sigmas}" if s else "mean"
         colors = signed_colors(s * along[m - 1], limits[0])
         return Cell(title, (mean + s * steps[m - 1]) @ R.T, T, colors, bar)
 
     return lambda scores: [cell(m, s) for m in modes for s in scores]
-
-
-def _sigmas(score):
-    return f"{round(score, 1) + 0.0:+.1f} σ".replace("-", "−")  # no minus before 0.0
 
 
 def _value_colors(values, label):
@@ -348,24 +336,6 @@ def _value_colors(values, label):
     return signed_colors(values, limit), bar
 
 
-def _views(widget):
-    """Yield the visible surfaces of a panel in their initial view."""
-    from s4a.show.panel_page import widgets_in
-
-    if hasattr(widget, "tabs"):  # of s4a.explore: the selected tab
-        widget = widget.tabs.children[widget.tabs.selected_index or 0]
-    for part in widgets_in(widget):
-        drawn = part.drawn() if hasattr(part, "drawn") else None
-        if drawn is not None and part.layout.display != "none":
-            X, T, colors = drawn
-            bar = part.bar if part.has_trait("bar") else part.bars.get(part.colors, {})
-            scores = [
-                f"mode {m} {_sigmas(s)}" for m, s in enumerate(getattr(part, "scores", ()), 1) if s
-            ]
-            title = getattr(part, "title", ", ".join(scores) or "mean")
-            yield Cell(title, X @ np.reshape(part.rotation, (3, 3)).T, T, colors, bar)
-
-
 def _rotated(cell, axis, angle):
     """Rotate a cell around an axis through the centre of its bounding box."""
     Q = Rotation.from_rotvec(angle * axis).as_matrix()
@@ -373,39 +343,31 @@ def _rotated(cell, axis, angle):
     return cell._replace(points=(cell.points - middle) @ Q.T + middle)
 
 
-def _frames(times, shared):
-    """Return frames ``(cell, 2, 2)`` of one size around cells at all times, or one `shared`."""
-    boxes = np.array([[plane_box(cell.points, "top") for cell in cells] for cells in times])
-    low, high = boxes[:, :, 0].min(0), boxes[:, :, 1].max(0)  # (cell, 2)
-    if shared:
-        low, high = np.full_like(low, low.min(0)), np.full_like(high, high.max(0))
-    half, middle = (high - low).max(0) / 2, (low + high) / 2
-    return np.stack([middle - half, middle + half], axis=1)
+def _frame(times):
+    """Return a frame ``(2, 2)`` around all cells at all times."""
+    boxes = np.array([plane_box(cell.points, "top") for cells in times for cell in cells])
+    return np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
 
 
-def _compose(cells, frames, columns, width, title, transparent):
-    """Compose cells to a picture with titles, and a colour bar for each or one for all."""
+def _compose(cells, frame, columns, width, title, transparent):
+    """Compose cells to a picture with titles and one colour bar."""
     size = width // columns
-    extent = frames[0, 1] - frames[0, 0]
+    extent = frame[1] - frame[0]
     height = round(size * np.clip(extent[1] / extent[0], 0.4, 1.5))
     text = max(9, min(width // 40, size // 16))  # pixels
-    one_bar = all(cell.bar == cells[0].bar for cell in cells)
-    line, bar = 3 * text // 2, 3 * text if any(cell.bar for cell in cells) else 0
-    top, row = line * bool(title), line + height + bar * (not one_bar)
-    n_rows = -(-len(cells) // columns)
-    image = Image.new("RGBA", (width, top + n_rows * row + bar * one_bar), (255, 255, 255, 0))
+    line, bar = 3 * text // 2, 3 * text if cells[0].bar else 0
+    top, row = line * bool(title), line + height
+    bottom = top + row * -(-len(cells) // columns)
+    image = Image.new("RGBA", (width, bottom + bar), (255, 255, 255, 0))
     if not transparent:
         image.paste((255, 255, 255, 255), (0, 0, *image.size))
     _write(image, title, (width / 2, line / 2), text * 1.2, width)
-    for i, (cell, frame) in enumerate(zip(cells, frames, strict=True)):
+    for i, cell in enumerate(cells):
         x, y = i % columns * size, top + i // columns * row
         _write(image, cell.title, (x + size / 2, y + line / 2), text, 0.96 * size)
         picture = Image.fromarray(_rendered(cell, (size, height), frame))
         image.alpha_composite(picture, (x, y + line))
-        if not one_bar:
-            _bar(image, cell.bar, (x + size / 2, y + line + height), text, 0.9 * size)
-    if one_bar:
-        _bar(image, cells[0].bar, (width / 2, top + n_rows * row), text, 0.9 * width)
+    _bar(image, cells[0].bar, (width / 2, bottom), text, 0.9 * width)
     return image
 
 

@@ -9,38 +9,8 @@ from matplotlib.transforms import Bbox
 from s4a.show.draw import data_uri
 
 GAP = 8  # pixels between tiles
-SHRINK, GROW = 0.7, 1.6  # smallest and largest scale of a tile, relative to the figure
+SHRINK, GROW = 0.85, 1.6  # smallest and largest scale of a tile, relative to the figure
 PAGE = Path(__file__).parent / "templates" / "figure.html"
-
-
-def _layouts(widths):
-    """Return the layouts of tiles in one row, two rows, and so on.
-
-    A layout is the total width of the widest row, an upper bound of the gaps in it, and the width
-    of the cell below which this number of rows is used (None for one row).  All tiles have one
-    scale, in as few rows as keep it above `SHRINK`.
-    """
-    n = len(widths)
-    sums = sorted({sum(widths[i:j]) for i in range(n) for j in range(i + 1, n + 1)})
-    layouts, below = [], None
-    for n_rows in range(1, n + 1):
-        row_width = next(width for width in sums if _row_count(widths, width) <= n_rows)
-        gaps = GAP * (n - n_rows) + 1
-        layouts.append((row_width, gaps, below))
-        below = round(SHRINK * row_width) + gaps
-    return layouts
-
-
-def _row_count(widths, row_width):
-    """Return the number of rows of at most `row_width` that the tiles fill."""
-    count, filled = 1, 0
-    for width in widths:
-        if width > row_width:
-            return len(widths) + 1
-        if filled + width > row_width:
-            count, filled = count + 1, 0
-        filled += width
-    return count
 
 
 class TiledFigure(Figure):
@@ -81,14 +51,11 @@ class TiledFigure(Figure):
             self.savefig(file, format="png", dpi=192, bbox_inches=inches)
             for ax in hidden:
                 ax.set_visible(True)
-            width = round(96 * inches.width)
-            address = data_uri(file.getvalue(), "image/png")
-            tiles.append((width, round(GROW * width), address))
+            tiles.append((round(96 * inches.width), data_uri(file.getvalue(), "image/png")))
         self.set_layout_engine(layout)
         page = Environment(autoescape=True).from_string(PAGE.read_text("utf-8"))
-        layouts = _layouts([width for width, *_ in tiles])
         texts = {"alt": self.alt or title, "title": title}
-        return page.render(**texts, gap=GAP, tiles=tiles, layouts=layouts).strip()
+        return page.render(**texts, tiles=tiles, gap=GAP, shrink=SHRINK, grow=GROW).strip()
 
     def _boxes(self):
         """Return the axes of each tile and its bounding box; several rows are one tile."""

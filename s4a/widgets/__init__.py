@@ -12,33 +12,18 @@ except ImportError as error:
     ) from error
 
 from s4a.extensions import extensions
-from s4a.widgets.comparison import Comparison
-from s4a.widgets.correspondence import Correspondence
-from s4a.widgets.explore import Explore
-from s4a.widgets.functional import FunctionalMap
-from s4a.widgets.maps import Maps
-from s4a.widgets.median import Median
-from s4a.widgets.modes import Modes
-from s4a.widgets.network import Network
-from s4a.widgets.panel import Panel
-from s4a.widgets.progress import Progress
-from s4a.widgets.spectrum import Spectrum
-from s4a.widgets.transfer import Transfer
-
-__all__ = [
-    "Comparison",
-    "Correspondence",
-    "Explore",
-    "FunctionalMap",
-    "Maps",
-    "Median",
-    "Modes",
-    "Network",
-    "Panel",
-    "Progress",
-    "Spectrum",
-    "Transfer",
-]
+from s4a.widgets.comparison import Comparison as Comparison
+from s4a.widgets.correspondence import Correspondence as Correspondence
+from s4a.widgets.explore import Explore as Explore
+from s4a.widgets.functional import FunctionalMap as FunctionalMap
+from s4a.widgets.maps import Maps as Maps
+from s4a.widgets.median import Median as Median
+from s4a.widgets.modes import Modes as Modes
+from s4a.widgets.network import Network as Network
+from s4a.widgets.panel import Panel as Panel
+from s4a.widgets.progress import Progress as Progress
+from s4a.widgets.spectrum import Spectrum as Spectrum
+from s4a.widgets.transfer import Transfer as Transfer
 
 
 def __getattr__(name: str) -> Any:

@@ -192,8 +192,7 @@ class Network(Panel):
             edges=self.shown,
         )
         self.show_facts(pairs, values[self.allowed])
-        scale = color_scale(CYCLE_ERROR, low, high, ERRORS)
-        self.bar.value = PARTS.color_bar(scale["colors"], f"{low:.2g}", f"{high:.2g}", ERRORS)
+        self.bar.value = PARTS.color_bar(color_scale(CYCLE_ERROR, low, high, ERRORS))
 
     def show_facts(self, pairs: Array, values: Array) -> None:
         """Show connectivity and cycle errors of the graph of some pairs."""

@@ -37,17 +37,6 @@ from s4a.show.surfaces import (
 )
 from s4a.show.surfaces import surface as study_surface
 
-__all__ = [
-    "ModesMesh",
-    "Scores",
-    "correspondence",
-    "field_colors",
-    "modes",
-    "network",
-    "points",
-    "renderer",
-    "surface",
-]
 LANDMARK = draw.OKABE_ITO[0]
 SCRIPTS = Path(__file__).parent / "scripts"
 WIDTH = 2048  # texels in a row of the table of modes: a power of two, so that indices are exact

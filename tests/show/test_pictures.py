@@ -93,31 +93,6 @@ def test_the_scale_of_nonnegative_numbers_begins_at_0_in_white(tmp_path):
     assert len(reddest(frames[150:190])) == 0
 
 
-def test_a_panel_is_drawn_in_its_current_state_without_a_browser(example_study, tmp_path):
-    widgets = pytest.importorskip("s4a.widgets")
-    panel = widgets.FunctionalMap(example_study)
-    first = pixels(s4a.write_picture(panel, tmp_path / "a.png", width=300))
-    panel.cell = (3, 3)
-    second = pixels(s4a.write_picture(panel, tmp_path / "b.png", width=300))
-    for half in np.split(np.abs(first - second), 2, axis=1):  # both of its surfaces
-        assert half.max() > 60
-    panel.close()
-
-
-def test_every_panel_with_a_surface_is_drawn_and_of_tabs_the_selected_one(example_study, tmp_path):
-    panels = pytest.importorskip("s4a.widgets.explore")
-    tabs = panels.explore(example_study)
-    sizes = []
-    for title in panels.PANELS:
-        panel = tabs[title]
-        for what in (panel, tabs):
-            path = s4a.write_picture(what, tmp_path / "a.png", width=200)
-            with Image.open(path) as picture:
-                sizes.append(picture.size)
-    assert sizes[::2] == sizes[1::2]
-    tabs.close()
-
-
 def test_values_of_another_mesh_are_refused(tmp_path):
     mesh = s4a.synthetic.brains(1, 300)["original/brain_01"].to_dataset()
     n = mesh.sizes["vertex"]
@@ -183,5 +158,5 @@ def test_an_impossible_film_is_refused(study, tmp_path):
         s4a.write_film(study, tmp_path / "a.webm")
     with pytest.raises(ValueError, match="turn=True"):
         s4a.write_film(as_dataset(*sphere()), tmp_path / "a.gif")
-    with pytest.raises(ValueError, match="a mesh or a panel with a surface is needed, found str"):
+    with pytest.raises(ValueError, match="or a mesh, is needed, found str; a panel"):
         s4a.write_film("study", tmp_path / "a.gif", turn=True)

@@ -179,7 +179,7 @@ def test_the_page_shows_the_results_of_the_study(study, html):
     median, template = study["latent"].attrs["median"], study["registration"].attrs["template"]
     summary = f"7 shapes, 1 repaired, 0 flagged, 1 excluded; median {median}; template {template}; "
     first = study["pca"]["explained_variance_ratio"].values[0]
-    texts = [f"{median}, the median", "1,200", "mode 3, +3 σ, from behind"]
+    texts = [f"{median}, the median", "1,200", "mode 3, +3 σ, from behind", "mode 1, −3 σ"]
     for text in (summary, *texts, f"{100 * first:.1f}% of the variance"):
         assert text in html
 
