@@ -22,7 +22,7 @@ These terms do not keep a surface from sliding over its own boundary.  If both b
 after two steps, squared distances between them, across the boundary and within the surface, are
 added with the boundary's length as weight.
 
-From the third step on, a_i is multiplied by the weight of Welsch, exp(-|y_i - z_i|^2 / (18 r^2)), r
+From the third step on, a_i is multiplied by the weight of Welsch, exp(-|y_i - z_i|^2 / (50 r^2)), r
 the root mean square distance, as in the robust non-rigid ICP of Yao et al. (CVPR 2020).  A vertex
 whose nearest point is far, perhaps on another fold, counts less.
 
@@ -62,7 +62,7 @@ STIFFNESS = 1e-4 * 1e-3 ** (np.arange(_N_STEPS + _N_FURTHER) / (_N_STEPS - 1))
 # tangential weight in the first two steps, in which initialisations converge, and in the others, in
 # which vertices must not drift along the surface
 SLIDE = (0.01, 0.1)
-_OUTLIER = 3.0  # multiple of the root mean square distance, at which a weight is exp(-1/2)
+_OUTLIER = 5.0  # multiple of the root mean square distance, at which a weight is exp(-1/2)
 _MAX_GROWTH = 1.2  # factor of growth of the bending energy below which it has converged
 BOUNDARY_WEIGHT = 0.01  # share of sqrt(area): weight of boundary distances, times the length
 _MAX_BOUNDARY_DISTANCE = 0.03  # share of sqrt(area): more distant boundaries do not correspond
@@ -162,12 +162,12 @@ def outlier_weight(offset: Array, area: Array) -> Array:
 
     Examples
     --------
-    Equal distances have equal weights, exp(-1/18):
+    Equal distances have equal weights, exp(-1/50):
 
     >>> import numpy as np
     >>> from s4a.method.elastic import outlier_weight
     >>> outlier_weight(np.eye(3), np.ones(3)).round(3).tolist()
-    [0.946, 0.946, 0.946]
+    [0.98, 0.98, 0.98]
     """
     distance2 = (offset**2).sum(1)
     scale2 = _OUTLIER**2 * (area @ distance2) / area.sum()

@@ -154,7 +154,7 @@ def test_a_part_that_the_template_lacks_moves_the_rest_little(pair, monkeypatch)
         monkeypatch.setattr(elastic, "outlier_weight", weight)
         warp = elastic.elastic_iterations(source, low, (np.eye(3), np.zeros(3), np.zeros((60, 3))))
         moved.append(error(spectral_icp.move(low, warp)[rest], low.X[rest]))
-    assert moved[0] < 0.7 * moved[1], moved
+    assert moved[0] < 0.85 * moved[1], moved
 
 
 def test_local_iterations_fit_a_bump_outside_the_span_of_the_basis(pair):
