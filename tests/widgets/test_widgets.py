@@ -884,6 +884,25 @@ def test_a_correspondence_has_no_map_for_which_the_template_lacks_its_low_resolu
     both.close()
 
 
+@pytest.mark.parametrize("lost", ["original", "original/{template}", "registration/brain_07"])
+def test_shapes_without_what_composing_needs_are_matched_from_the_template_alone(inserted, lost):
+    template = inserted["registration"].attrs["template"]
+    nodes = {node.path: node.to_dataset(inherit=False) for node in inserted.subtree}
+    path = "/" + lost.format(template=template)
+    part = xr.DataTree.from_dict(
+        {name: nodes[name] for name in nodes if not f"{name}/".startswith(f"{path}/")}
+    )
+    if lost == "original":
+        with pytest.raises(ValueError, match="needs original, which"):
+            Correspondence(part)
+        return
+    both = Correspondence(part)
+    assert [value for _, value in both.left.options] == [template]
+    both.adopt(("brain_07", "brain_07"), "brain_07")
+    assert (both.source, both.message.value) == (template, "")
+    both.close()
+
+
 def test_a_study_without_a_second_shape_is_refused(inserted):
     template = inserted["registration"].attrs["template"]
     nodes = {node.path: node.to_dataset(inherit=False) for node in inserted.subtree}
