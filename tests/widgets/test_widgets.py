@@ -232,8 +232,8 @@ def test_edges_are_coloured_before_and_after_on_one_scale(study, panel):
         colors = [to_rgb(color) for color in network.graph.spec["colors"]]
         np.testing.assert_allclose(colors, cycle_error_colors(errors, limits), atol=1 / 255)
         assert f"cycle errors {errors.min():.3f} to {errors.max():.3f}" in network.facts.value
-    assert f">{limits[0]:.2g}<" in bar
-    assert f">{limits[1]:.2g}<" in bar
+    assert f">{limits[0]:.3g}<" in bar
+    assert f">{limits[1]:.3g}<" in bar
     lines = charts.network(
         charts.on_circle(len(network.names)),
         network.names,
