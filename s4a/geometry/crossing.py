@@ -14,7 +14,7 @@ from s4a.schema import Array
 
 log = logging.getLogger(__name__)
 
-# intersecting pairs are in memory together, 40 bytes each
+# intersecting pairs are in memory together, 80 bytes each
 _MOST_PAIRS = 10_000_000
 # boxes of neighbours overlap on every surface, about 7 pairs a triangle, and few of them intersect;
 # the estimate is slower: 13 instead of 5 s for 2 million triangles
@@ -61,6 +61,7 @@ def count_crossing(X: Array, T: Array, *, most_pairs: int | None = None) -> int:
     if expected <= most_pairs:
         _, pair, _ = igl.predicates.find_self_intersections(X, T)
         return len(np.unique(pair))
+    most_pairs = min(most_pairs, _MOST_PAIRS)
     sample = evenly(len(T), max(10, int(len(T) * most_pairs / (2 * expected))))
     some = np.ascontiguousarray(T[sample])
     _, pair, _ = igl.predicates.find_intersections(X, some, X, T)

@@ -331,10 +331,15 @@ def npy(data: bytes) -> np.ndarray:
     [[1, 2], [3, 4]]
     """
     file, npy_format = io.BytesIO(data), np.lib.format
-    is_first = npy_format.read_magic(file) == (1, 0)
-    read = npy_format.read_array_header_1_0 if is_first else npy_format.read_array_header_2_0
-    with warnings.catch_warnings(action="ignore"):  # of headers that Python 2 wrote
-        shape, by_column, dtype = read(file)
+    try:
+        is_first = npy_format.read_magic(file) == (1, 0)
+        read = npy_format.read_array_header_1_0 if is_first else npy_format.read_array_header_2_0
+        with warnings.catch_warnings(action="ignore"):  # of headers that Python 2 wrote
+            shape, by_column, dtype = read(file)
+    except Exception as error:  # also MemoryError, and advice to programmers
+        raise ValueError(
+            f"an array as numpy.save writes it expected, found {data[:100]!r}; export it again"
+        ) from error
     if dtype.kind not in "biufU":
         raise ValueError(
             f"an array of numbers or text, without pickled objects, expected; found {dtype}"

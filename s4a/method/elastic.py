@@ -22,7 +22,7 @@ These terms do not keep a surface from sliding over its own boundary.  If both b
 after two steps, squared distances between them, across the boundary and within the surface, are
 added with the boundary's length as weight.
 
-From the third step on, a_i is multiplied by the weight of Welsch, exp(-|y_i - z_i|^2 / (50 r^2)), r
+From the third step on, a_i is multiplied by the Welsch weight, exp(-|y_i - z_i|^2 / (50 r^2)), r
 the root mean square distance, as in the robust non-rigid ICP of Yao et al. (CVPR 2020).  A vertex
 whose nearest point is far, perhaps on another fold, counts less.
 
@@ -153,7 +153,7 @@ class Landmarks(NamedTuple):
 
 
 def outlier_weight(offset: Array, area: Array) -> Array:
-    """Return weights of Welsch ``(n,)`` for the vectors `offset` ``(n, 3)`` to nearest points.
+    """Return Welsch weights ``(n,)`` for the vectors `offset` ``(n, 3)`` to nearest points.
 
     References
     ----------

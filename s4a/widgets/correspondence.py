@@ -71,7 +71,7 @@ class Correspondence(Panel):
     s4a.widgets.Comparison : matches of other methods.
     """
 
-    needs = ("registration/position", "registration/registered_match")
+    needs = ("registration/position", "registration/registered_match", "original")
     title = "Correspondence"
     source, shape = traitlets.Unicode(""), traitlets.Unicode("")
     vertex, image = traitlets.Int(-1), traitlets.Int(-1)
@@ -86,7 +86,11 @@ class Correspondence(Panel):
         latent = has(self.study, "latent/latent_basis") and has(self.study, "coarse")
         latent = latent and self.template in self.study["coarse"].children
         shapes = labelled(self.study, self.names)
-        options = [(f"{self.template}, the template", self.template), *shapes]
+        options = [(f"{self.template}, the template", self.template)]
+        if self.template in self.study["original"].children and all(
+            name in self.study["registration"].children for name in self.names
+        ):  # else two shapes cannot be composed
+            options += shapes
         self.left = dropdown("source", "the shape on the left", options)
         self.choice = dropdown("shape", "the shape on the right", shapes)
         self.map = dropdown("map", WHICH, MAPS if latent else MAPS[:1], layout={"width": "28em"})
@@ -115,7 +119,7 @@ class Correspondence(Panel):
         """Show a pair of registered shapes; the template, if it is in the pair, on the left."""
         self.selected_pair = pair
         source, target = pair if pair[1] != self.template else pair[::-1]
-        if source in (self.template, *self.names) and target in self.names:
+        if source in dict(self.left.options).values() and target in self.names:
             self.show_pair(source, target)
 
     def show_pair(self, source: str, shape: str) -> None:
@@ -204,9 +208,10 @@ class Correspondence(Panel):
         self.shown = self.source, self.shape
         self.vertex = self.image = -1
         stage = "coarse" if self.map.value == "low" else "original"
-        source = surface(self.study, self.source, stage)
         if self.registered and self.from_template:
             source = mesh_of(self.study["registration"].dataset)
+        else:
+            source = surface(self.study, self.source, stage)
         self.pair = source, surface(self.study, self.shape, stage)
         appearance = self.registered_colors() if self.registered else self.latent_colors()
         colors, coordinates, bar, caption = appearance

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import s4a
+from s4a.geometry import crossing
 from s4a.geometry.crossing import count_crossing, expected_pairs
 from s4a.geometry.mesh import as_arrays
 
@@ -62,6 +63,21 @@ def test_a_crumpled_surface_is_told_from_a_sample_within_its_memory():
     crumpled = X[np.random.default_rng(0).permutation(len(X))]
     assert expected_pairs(crumpled, T) > 100 * expected_pairs(X, T)
     assert count_crossing(crumpled, T, most_pairs=1000) == pytest.approx(len(T), rel=0.05)
+
+
+def test_the_memory_of_an_estimate_does_not_grow_with_the_limit_of_counting(monkeypatch):
+    X, T = sphere(2000)
+    crumpled = X[np.random.default_rng(0).permutation(len(X))]
+    monkeypatch.setattr(crossing, "_MOST_PAIRS", 20_000)
+    found, find = [], crossing.igl.predicates.find_intersections
+
+    def spy(*meshes):
+        found.append(find(*meshes))
+        return found[0]
+
+    monkeypatch.setattr(crossing.igl.predicates, "find_intersections", spy)
+    assert crossing.count_crossing(crumpled, T) == pytest.approx(len(T), rel=0.05)
+    assert len(found[0][1]) < 30_000
 
 
 def test_what_a_sample_tells_is_what_counting_does():

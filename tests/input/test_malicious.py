@@ -163,6 +163,14 @@ def test_a_gifti_file_opens_no_other_file(tmp_path):
         read_labels(file(tmp_path / "a.gii", text))
 
 
+@pytest.mark.parametrize("shape", ["f()", "-" * 9000 + "1", "(" * 9000, " " * 12_000])
+def test_a_header_that_numpy_cannot_read_is_shown_and_not_evaluated(tmp_path, shape):
+    expected = r"numpy\.save writes it expected, found b.{60,140}; export it again"
+    for name, data in (("a.npy", array(shape)), ("b.npz", npz(label=array(shape)))):
+        with pytest.raises(ValueError, match=rf"{name}.*{expected}"):
+            read_labels(file(tmp_path / name, data))
+
+
 def test_an_array_that_promises_more_than_its_file_is_refused_before_room_is_made_for_it(tmp_path):
     for shape, kind in (((10**12,), "<i4"), ((10**12,), "<U0"), ((10**6, 10**6, 10**6), "<f8")):
         for name, data in (

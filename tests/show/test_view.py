@@ -12,6 +12,7 @@ from s4a import synthetic
 from s4a.geometry.mesh import as_arrays
 from s4a.schema import dataset
 from s4a.show import draw, page
+from s4a.show.browser import PARTS, color_scale
 from s4a.show.charts import svg, variance
 from s4a.show.surfaces import mode_limits
 
@@ -271,3 +272,9 @@ def test_modes_that_could_not_be_are_explained(study):
     del part["coarse"], part["registration"]
     missing = page.study_html(part).split("Missing:")[1:]
     assert any("three shapes are needed &lt;found 2&gt;" in text[:400] for text in missing)
+
+
+def test_a_colour_bar_of_a_page_has_three_digits_and_no_powers_of_ten_for_usual_lengths():
+    for limit, text in ((0.12345, "0.123"), (123.4, "123"), (1234.5, "1230")):
+        bar = PARTS.color_bar(color_scale("viridis", -limit, limit, "<b>"))
+        assert f"<span>−{text}</span><span>&lt;b&gt;</span><span>{text}</span>" in bar

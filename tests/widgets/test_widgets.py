@@ -232,8 +232,8 @@ def test_edges_are_coloured_before_and_after_on_one_scale(study, panel):
         colors = [to_rgb(color) for color in network.graph.spec["colors"]]
         np.testing.assert_allclose(colors, cycle_error_colors(errors, limits), atol=1 / 255)
         assert f"cycle errors {errors.min():.3f} to {errors.max():.3f}" in network.facts.value
-    assert f">{limits[0]:.2g}<" in bar
-    assert f">{limits[1]:.2g}<" in bar
+    assert f">{limits[0]:.3g}<" in bar
+    assert f">{limits[1]:.3g}<" in bar
     lines = charts.network(
         charts.on_circle(len(network.names)),
         network.names,
@@ -881,6 +881,25 @@ def test_labels_of_the_template_are_transferred_to_an_inserted_shape(inserted, t
 def test_a_correspondence_has_no_map_for_which_the_template_lacks_its_low_resolution(inserted):
     both = Correspondence(inserted)
     assert [value for _, value in both.map.options] == ["registered"]
+    both.close()
+
+
+@pytest.mark.parametrize("lost", ["original", "original/{template}", "registration/brain_07"])
+def test_shapes_without_what_composing_needs_are_matched_from_the_template_alone(inserted, lost):
+    template = inserted["registration"].attrs["template"]
+    nodes = {node.path: node.to_dataset(inherit=False) for node in inserted.subtree}
+    path = "/" + lost.format(template=template)
+    part = xr.DataTree.from_dict(
+        {name: nodes[name] for name in nodes if not f"{name}/".startswith(f"{path}/")}
+    )
+    if lost == "original":
+        with pytest.raises(ValueError, match="needs original, which"):
+            Correspondence(part)
+        return
+    both = Correspondence(part)
+    assert [value for _, value in both.left.options] == [template]
+    both.adopt(("brain_07", "brain_07"), "brain_07")
+    assert (both.source, both.message.value) == (template, "")
     both.close()
 
 
