@@ -12,13 +12,14 @@ from threadpoolctl import threadpool_limits
 from s4a.geometry.crossing import can_count
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input import plausibility
-from s4a.input.chirality import AUTO, is_mirrored, mirror_image, to_reflect
+from s4a.input.chirality import AUTO, is_mirrored, mirror_image
 from s4a.input.collection import shape_report
 from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.files import SUFFIXES as MESHES
 from s4a.input.files import files_named, suffix_of
 from s4a.input.landmarks import SUFFIXES
 from s4a.input.plausibility import Flag, find_warnings
+from s4a.input.subjects import listed
 from s4a.method.alignment import N_VOTERS, align_onto, less_confident
 from s4a.method.latent import out_of_sample_latent
 from s4a.method.pca import project_scores
@@ -229,8 +230,15 @@ def _reflected_of_new(reflect, meshes, given, descriptors):
         for remark in remarks:
             log.warning("%s", remark)
         return [name for name, (is_other, _) in decided.items() if is_other], remarks
-    texts = reflect if isinstance(reflect, str) else ",".join(map(str, reflect))
-    return [name for name in to_reflect(texts, given, None) if name in meshes], []
+    names = reflect.split(",") if isinstance(reflect, str) else reflect
+    names = [str(name).strip() for name in names]
+    unknown = [repr(name) for name in names if name not in given]
+    if unknown:
+        raise ValueError(
+            f"reflect={reflect!r}: {listed(unknown)} is not a new shape ({listed(given)}); "
+            "'auto' mirrors new shapes with the opposite chirality"
+        )
+    return [name for name in names if name in meshes], []
 
 
 def compare_chirality(

@@ -128,7 +128,7 @@ def test_a_new_shape_of_the_other_side_is_flagged_by_default(new_mirrored, folde
 def test_an_undetermined_side_is_reported_and_an_unknown_name_is_an_error(
     new_mirrored, folder, study, meshes, caplog
 ):
-    with pytest.raises(ValueError, match=r"'s8' is not a shape \(s9\)"):
+    with pytest.raises(ValueError, match=r"'s8' is not a new shape \(s9\)"):
         s4a.insert(open_study(folder), {"s9": new_mirrored[0]}, reflect="s8", n_jobs=1)
     brain = meshes["brain_02"]
     result = s4a.insert(study, {"again": brain}, reflect="auto", n_jobs=1)
@@ -144,4 +144,4 @@ def test_the_command_of_new_shapes_mirrors_them_too(new_mirrored, folder, tmp_pa
     assert cli.main([*command, "--reflect", "s9", "--n-jobs", "1"]) == 0
     assert "mirror image" not in capsys.readouterr().out
     assert cli.main([*command, "--reflect", "s1", "--n-jobs", "1"]) == 2
-    assert "'s1' is not a shape (s9)" in capsys.readouterr().err
+    assert "'s1' is not a new shape (s9)" in capsys.readouterr().err
