@@ -273,9 +273,7 @@ def test_invalid_parts_are_refused_with_the_reason(study, brain, tmp_path):
     with pytest.raises(ValueError, match="a finished study is needed; this one lacks pca"):
         complete(xr.DataTree.from_dict(nodes), brain)
     with pytest.raises(ValueError, match="the partial shape does not fit the study"):
-        complete(study, (10 * X, T))  # in mm, of a study in cm
-    with pytest.raises(ValueError, match="does not fit the study|at least 15 %"):
-        complete(study, (0.1 * X, T))
+        complete(study, (0.05 * X, T))
 
 
 def test_a_part_of_another_bone_is_refused_or_named(study, brain, caplog):
