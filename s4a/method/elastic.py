@@ -22,10 +22,6 @@ These terms do not keep a surface from sliding over its own boundary.  If both b
 after two steps, squared distances between them, across the boundary and within the surface, are
 added with the boundary's length as weight.
 
-From the third step on, a_i is multiplied by the Welsch weight, exp(-|y_i - z_i|^2 / (50 r^2)), r
-the root mean square distance, as in the robust non-rigid ICP of Yao et al. (CVPR 2020).  A vertex
-whose nearest point is far, perhaps on another fold, counts less.
-
 Landmarks marked on both surfaces add their squared distances, with equal weights.  Fields given on
 both surfaces, such as sulcal depth, enter the nearest-neighbour search next to position and normal.
 
@@ -62,7 +58,6 @@ STIFFNESS = 1e-4 * 1e-3 ** (np.arange(_N_STEPS + _N_FURTHER) / (_N_STEPS - 1))
 # tangential weight in the first two steps, in which initialisations converge, and in the others, in
 # which vertices must not drift along the surface
 SLIDE = (0.01, 0.1)
-_OUTLIER = 5.0  # multiple of the root mean square distance, at which a weight is exp(-1/2)
 _MAX_GROWTH = 1.2  # factor of growth of the bending energy below which it has converged
 BOUNDARY_WEIGHT = 0.01  # share of sqrt(area): weight of boundary distances, times the length
 _MAX_BOUNDARY_DISTANCE = 0.03  # share of sqrt(area): more distant boundaries do not correspond
@@ -150,28 +145,6 @@ class Landmarks(NamedTuple):
 
     on_target: Basis  # as a surface without triangles: X (l, 3), and U (l, n) to low resolution
     y: Array  # (l, 3), on the source
-
-
-def outlier_weight(offset: Array, area: Array) -> Array:
-    """Return Welsch weights ``(n,)`` for the vectors `offset` ``(n, 3)`` to nearest points.
-
-    References
-    ----------
-    Y. Yao, B. Deng, W. Xu and J. Zhang (2020), Quasi-Newton solver for robust non-rigid
-    registration, CVPR.
-
-    Examples
-    --------
-    Equal distances have equal weights, exp(-1/50):
-
-    >>> import numpy as np
-    >>> from s4a.method.elastic import outlier_weight
-    >>> outlier_weight(np.eye(3), np.ones(3)).round(3).tolist()
-    [0.98, 0.98, 0.98]
-    """
-    distance2 = (offset**2).sum(1)
-    scale2 = _OUTLIER**2 * (area @ distance2) / area.sum()
-    return np.exp(-distance2 / (2 * scale2 + 1e-300))
 
 
 def boundary_attraction(
@@ -345,7 +318,7 @@ def elastic_iterations(
         nearest = cKDTree(target.X[vertices]).query(target.X)[1]
         area = np.bincount(nearest, target.area, len(vertices))
     F = E_B[vertices]
-    weight, mass = area, F.T @ (area[:, None] * F)
+    mass = F.T @ (area[:, None] * F)
     n_fixed = len(schedule.stiffness) - schedule.further
     for step, stiffness in enumerate(schedule.stiffness):
         if step >= n_fixed and energies[-1] > _MAX_GROWTH * energies[-2]:
@@ -356,17 +329,13 @@ def elastic_iterations(
         slide = schedule.slide[step >= 2]
         for _ in range(schedule.iterations):
             y, m = _attraction(source, target, X, vertices)
-            offset = y - X[vertices]
-            if step >= 2:
-                weight = area * outlier_weight(offset, area)
-                mass = F.T @ (weight[:, None] * F)
             # for the change of w, whose rounding is smaller than that of w
-            matrix, right = normal_equations(F, weight, m, offset, slide, mass)
+            matrix, right = normal_equations(F, area, m, y - X[vertices], slide, mass)
             boundary = boundary_attraction(source, target, X) if step >= 2 else None
             if boundary is not None:
                 vertex, length, across, y = boundary
-                length = BOUNDARY_WEIGHT * length
-                terms = normal_equations(E_B[vertex], length, across, y - X[vertex], 0.0)
+                weight, residual = BOUNDARY_WEIGHT * length, y - X[vertex]
+                terms = normal_equations(E_B[vertex], weight, across, residual, 0.0)
                 matrix += terms[0]
                 right += terms[1]
             if len(goal):
