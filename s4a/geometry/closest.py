@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
+from joblib import effective_n_jobs
 from scipy.spatial import cKDTree
 
 from s4a.geometry.compiled import igl
@@ -154,8 +155,11 @@ class FeatureTree:
         self._tree = cKDTree(rows.take(self._order, axis=0), **options)
 
     def query(self, rows: Array) -> tuple[Array, Array]:
-        """Return the distance and the index of the nearest row, for each of some rows (q, d)."""
-        distance, nearest = self._tree.query(rows)
+        """Return the distance and the index of the nearest row, for each of some rows (q, d).
+
+        In as many threads as ``joblib.parallel_config`` says, one by default.
+        """
+        distance, nearest = self._tree.query(rows, workers=effective_n_jobs(None))
         return distance, self._order.take(nearest)
 
 

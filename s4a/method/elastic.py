@@ -45,6 +45,7 @@ from scipy.spatial import cKDTree
 
 from s4a.geometry.align import rigid_transform
 from s4a.geometry.closest import closest_point_in_star, features, interpolate
+from s4a.method.network import in_threads
 from s4a.method.shape import Basis, common_fields, field_columns
 from s4a.method.spectral import Diffusion
 from s4a.method.spectral_icp import Warp, apply_transform, move
@@ -378,8 +379,11 @@ def converging_initialisations(
     """
     options: dict[str, Any] = {"vertices": target.sample_vertices_of(), "landmarks": landmarks}
     groups: dict[str, list[Warp]] = {}
-    for name, initial in warps.items():
-        warp = elastic_iterations(source, target, initial, CONVERGENCE, **options)
+    converged = in_threads(
+        lambda initial: elastic_iterations(source, target, initial, CONVERGENCE, **options),
+        warps.values(),
+    )
+    for name, warp in zip(warps, converged, strict=True):
         X = move(target, warp)
         near = (
             group

@@ -306,7 +306,9 @@ def nearest_by_maps(pairs: Array, n: int, selected: list[int], most: int) -> Arr
     return np.sort(np.argsort(steps, kind="stable")[:most])
 
 
-def in_threads(function: Callable[..., Any], items: Iterable[Any], n_jobs: int | None) -> list[Any]:
+def in_threads(
+    function: Callable[..., Any], items: Iterable[Any], n_jobs: int | None = None
+) -> list[Any]:
     """Map a function over items in threads, in order.
 
     Uses the standard library, as joblib polls its threads every hundredth of a second, which is too
@@ -318,7 +320,7 @@ def in_threads(function: Callable[..., Any], items: Iterable[Any], n_jobs: int |
         It should release the interpreter lock, as NumPy does in products.
     items : iterable
     n_jobs : int, optional
-        Threads, as in joblib.
+        Threads, as in joblib; None for those of ``joblib.parallel_config``, one by default.
 
     Examples
     --------
@@ -326,8 +328,8 @@ def in_threads(function: Callable[..., Any], items: Iterable[Any], n_jobs: int |
     >>> in_threads(abs, [-1, 2], 2)
     [1, 2]
     """
-    n_threads = effective_n_jobs(n_jobs)
-    if n_threads == 1:
+    items, n_threads = list(items), effective_n_jobs(n_jobs)
+    if n_threads == 1 or len(items) == 1:
         return [function(item) for item in items]
     with ThreadPoolExecutor(n_threads) as pool:
         return list(pool.map(function, items))

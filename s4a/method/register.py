@@ -27,6 +27,7 @@ from s4a.method.elastic import (
 from s4a.method.fmap import fmap_from_match
 from s4a.method.initial_map import nearest_after_alignment
 from s4a.method.nearest import nearest_in_cells, nearest_of_few, nearest_rows
+from s4a.method.network import in_threads
 from s4a.method.shape import Basis, Shape
 from s4a.options import check
 from s4a.schema import INPUT, Array, dataset, in_unit
@@ -463,12 +464,12 @@ def register_surface(
         warps = {n: candidates[n].warp for n in names if candidates[n].warp[0].ndim == 2}
         names = [name for name in names if name not in warps]  # piecewise rigid
         surfaces = elastic_surfaces(source, target, warps)
-        results = {f"{name}+elastic": _score_nearest(M, N, X) for name, X in surfaces.items()}
+        results = _scored(M, N, surfaces, "elastic")
         limit = MAX_STRAIN * (1 - _STRAIN_REDUCTION if len(target.low.X) < FEW else 1)
         if results and strain_quantile(results[_lowest_score(results)][1], N) > limit:
             strained = results[_lowest_score(results)]
             surfaces = elastic_surfaces(source, target, warps, less_stiff=True)
-            scored = {f"{name}+looser": _score_nearest(M, N, X) for name, X in surfaces.items()}
+            scored = _scored(M, N, surfaces, "looser")
             results |= {name: r for name, r in scored.items() if improves(r, strained, N)}
     for name in names:
         if name == "intrinsic":
@@ -519,6 +520,12 @@ def improves(result: tuple[float, Basis], strained: tuple[float, Basis], target:
     return after < _MAX_REMAINING * before
 
 
+def _scored(source, target, surfaces, step):
+    """Score and registered target of each surface, by the name of its initialisation and step."""
+    scored = in_threads(lambda X: _score_nearest(source, target, X), surfaces.values())
+    return dict(zip([f"{name}+{step}" for name in surfaces], scored, strict=True))
+
+
 def _score_nearest(source, target, X):
     """Score of the registered target, matched by nearest vertices, and the registered target."""
     moved = target.moved_to(X)
@@ -546,11 +553,12 @@ def elastic_surfaces(
             schedule = NO_SLIDING
         else:
             warps = converged
-    surfaces = {}
-    for name, initial in warps.items():
+
+    def surface(initial):
         warp = elastic_iterations(M, N, initial, schedule, landmarks=landmarks)
-        surfaces[name] = _after_local_iterations(source, target, warp)
-    return surfaces
+        return _after_local_iterations(source, target, warp)
+
+    return dict(zip(warps, in_threads(surface, warps.values()), strict=True))
 
 
 def _common_landmarks(source, target):

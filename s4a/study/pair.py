@@ -1,11 +1,12 @@
 """Pairwise registration (4.1): from two meshes to a correspondence."""
 
 import logging
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from joblib import delayed
+from joblib import delayed, parallel_config
 from threadpoolctl import threadpool_limits
 
 from s4a.input.collection import Mesh, as_meshes
@@ -13,6 +14,7 @@ from s4a.input.coordinates import in_one_system
 from s4a.method import fmap
 from s4a.method.alignment import align_onto, alignment_residual, less_confident
 from s4a.method.initial_map import initial_map
+from s4a.method.network import in_threads
 from s4a.method.refined_eigenfunctions import low_resolution
 from s4a.method.register import identity, refine_at_full_resolution, register
 from s4a.method.shape import Shape
@@ -31,6 +33,7 @@ def match_pair(
     *,
     preset: str | None = None,
     keep_iterations: bool = False,
+    n_jobs: int | None = None,
     **options: Any,
 ) -> xr.Dataset:
     """Match two shapes at full resolution (4.1).
@@ -50,6 +53,9 @@ def match_pair(
     keep_iterations : bool
         Whether to return map and match of every iteration of ZoomOut, and the descriptors of the
         initial map.
+    n_jobs : int, optional
+        Number of threads, as in joblib: -1 for all cores, None for one.  The result does not depend
+        on it.
     **options
         Those of :class:`s4a.Options` that apply to pairs, such as ``n_coarse``, ``k``, ``refine``
         and ``seed`` (or ``rng``); the message about another one lists them.
@@ -125,9 +131,10 @@ def match_pair(
     settings = given_options({"preset": preset, **options}, pair=True)
     settings = settings.changed({"keep_iterations": keep_iterations})
     meshes = as_meshes({"source": source, "target": target}, settings)
-    M, N = (shape_of(mesh, settings) for mesh in meshes.values())
-    with threadpool_limits(1):
-        registration, maps = match_shapes(M, N, settings)
+    with parallel_config("threading", n_jobs=n_jobs) if n_jobs else nullcontext():
+        M, N = in_threads(lambda mesh: shape_of(mesh, settings), meshes.values())
+        with threadpool_limits(1):
+            registration, maps = match_shapes(M, N, settings)
     least = min(M.low.k, N.low.k)
     if least < settings.k:
         note = f"k = {settings.k} reduced to {least}, the eigenfunctions that the smaller mesh has"

@@ -1,6 +1,7 @@
 """Pairwise registration: use of threads, iterations of ZoomOut."""
 
 import numpy as np
+import xarray as xr
 from scipy.spatial.distance import cdist
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -47,3 +48,11 @@ def test_each_kept_iteration_of_zoomout_is_the_map_of_the_match_before_it(meshes
     assert np.array_equal(pair["iteration_fmap"][-1], pair["fmap"])
     assert pair["descriptor_of_source"].shape == (10, 80)
     assert "iteration_fmap" not in s4a.match_pair(source, target, preset="paper", **small)
+
+
+def test_the_result_of_a_pair_does_not_depend_on_the_number_of_threads(meshes):
+    source, target, *_ = meshes.values()
+    one, two = (
+        s4a.match_pair(source, target, n_coarse=300, k=20, k_init=10, n_jobs=n) for n in (1, 2)
+    )
+    xr.testing.assert_identical(one, two)
