@@ -15,14 +15,12 @@ step to step, as in the non-rigid ICP of Amberg, Romdhani and Vetter (CVPR 2007)
 bending energy has converged: then the template follows the shape.  If the energy still grows, less
 stiffness would fit noise.  Lengths are for surfaces of unit area.
 
-From the third step on, a_i is multiplied by the Welsch weight exp(-|y_i - z_i|^2 / (2 q^2 r^2)),
-r the root mean square distance and q = 5, as in the robust non-rigid ICP of Yao et al. (CVPR 2020).
-A vertex whose nearest point is far, perhaps on another fold, counts less.
-
 First, very stiff iterations merge similar initialisations into their mean
-(:func:`converging_initialisations`), with q = 3: without weights they do not converge where the
-nearest point of a vertex alternates between folds.  Surfaces such as tori slide onto themselves in
-these (:func:`slides`); then they are left out, and the tangential weight is larger.
+(:func:`converging_initialisations`).  In these, a_i is multiplied by the Welsch weight
+exp(-|y_i - z_i|^2 / (18 r^2)), r the root mean square distance, as in the robust non-rigid ICP of
+Yao et al. (CVPR 2020): otherwise they do not converge where the nearest point of a vertex
+alternates between folds.  Surfaces such as tori slide onto themselves in very stiff iterations
+(:func:`slides`); then they are left out, and the tangential weight is larger.
 
 These terms do not keep a surface from sliding over its own boundary.  If both boundaries coincide
 after two steps, squared distances between them, across the boundary and within the surface, are
@@ -83,13 +81,13 @@ class Schedule(NamedTuple):
     iterations: int  # of a step, at most
     tolerance: float  # share of sqrt(area): a step ends if an iteration moves vertices less
     slide: tuple[float, float] = SLIDE  # tangential weight in the first two steps, and the others
-    outlier: tuple[float, float] = (np.inf, 5.0)  # the same: `multiple` of outlier_weight
+    outlier: float = np.inf  # `multiple` of outlier_weight
 
 
 DEFORMATION = Schedule(STIFFNESS, _N_FURTHER, 8, 1e-3)
 # stiff enough for initialisations to converge.  Tuned on heads 2 to 10, reported on other
 # collections
-CONVERGENCE = Schedule(np.array([1e-2, 1e-3]), 0, 32, 1e-4, outlier=(3.0, 3.0))
+CONVERGENCE = Schedule(np.array([1e-2, 1e-3]), 0, 32, 1e-4, outlier=3.0)
 # with more tangential weight, for surfaces that slide onto themselves
 NO_SLIDING = DEFORMATION._replace(slide=(_LOCAL_SLIDE, _LOCAL_SLIDE))
 # very stiff iterations slide if they move the target farther than this share of sqrt(area), farther
@@ -228,7 +226,7 @@ def normal_equations(
     """Matrix ``(3 q, 3 q)`` and right side ``(3 q,)`` of the first term, for z = E w, w ``(q, 3)``.
 
     With W_i = slide I + (1 - slide) m_i m_i^T the term is sum_i a_i (z_i - y_i)^T W_i (z_i - y_i).
-    The unknowns are the stacked columns of w.  The matrix products are in single precision, which
+    The unknowns are the stacked columns of w.  The matrix product is in single precision, which
     takes half the time, with an error of 1e-5 of what `slide` adds.
 
     Parameters
@@ -243,13 +241,12 @@ def normal_equations(
         E^T diag(area) E, if already computed.
     """
     n, q = E.shape
-    single = E.astype(np.float32)
     # normal distances are those of one field: m_i^T z_i, in the 3 q unknowns
     weight = (np.sqrt((1 - slide) * area)[:, None] * m).astype(np.float32)
-    across = (weight[:, :, None] * single[:, None]).reshape(n, 3 * q)
+    across = (weight[:, :, None] * E.astype(np.float32)[:, None]).reshape(n, 3 * q)
     matrix = (across.T @ across).astype(float)
     if slide:
-        mass = single.T @ (area.astype(np.float32)[:, None] * single) if mass is None else mass
+        mass = E.T @ (area[:, None] * E) if mass is None else mass
         for i in range(0, 3 * q, q):
             matrix[i : i + q, i : i + q] += slide * mass
     along = np.einsum("ni,ni->n", m, y)[:, None] * m
@@ -349,7 +346,8 @@ def elastic_iterations(
         nearest = cKDTree(target.X[vertices]).query(target.X)[1]
         area = np.bincount(nearest, target.area, len(vertices))
     F = E_B[vertices]
-    mass_of_all = F.T @ (area[:, None] * F)
+    robust = np.isfinite(schedule.outlier)
+    weight, mass = area, None if robust else F.T @ (area[:, None] * F)
     n_fixed = len(schedule.stiffness) - schedule.further
     for step, stiffness in enumerate(schedule.stiffness):
         if step >= n_fixed and energies[-1] > _MAX_GROWTH * energies[-2]:
@@ -357,13 +355,12 @@ def elastic_iterations(
         penalty = np.kron(np.eye(3), B.T @ (stiffness * bending * B))
         # keeps the matrix definite if the initial positions are smooth
         penalty[np.diag_indices_from(penalty)] += 1e-12
-        slide, multiple = schedule.slide[step >= 2], schedule.outlier[step >= 2]
+        slide = schedule.slide[step >= 2]
         for _ in range(schedule.iterations):
             y, m = _attraction(source, target, X, vertices)
             offset = y - X[vertices]
-            weight, mass = area, mass_of_all
-            if np.isfinite(multiple):
-                weight, mass = area * outlier_weight(offset, area, multiple), None
+            if robust:
+                weight = area * outlier_weight(offset, area, schedule.outlier)
             # for the change of w, whose rounding is smaller than that of w
             matrix, right = normal_equations(F, weight, m, offset, slide, mass)
             boundary = boundary_attraction(source, target, X) if step >= 2 else None

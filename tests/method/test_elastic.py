@@ -144,6 +144,19 @@ def test_local_iterations_reduce_the_surface_distance_and_keep_the_accuracy(pair
     assert error(after, true_image) < 1.2 * error(before, true_image)
 
 
+def test_a_part_that_the_template_lacks_moves_the_rest_little(pair):
+    low = pair[0].low
+    distance = np.linalg.norm(low.X - low.X[100], axis=1)
+    bump = 0.2 * np.exp(-((distance / 0.06) ** 2))[:, None] * low.normals
+    source = replace(low, X=low.X + bump)
+    rest, moved = distance > 0.15, []
+    warp = np.eye(3), np.zeros(3), np.zeros((60, 3))
+    for schedule in (elastic.CONVERGENCE, elastic.CONVERGENCE._replace(outlier=np.inf)):
+        X = spectral_icp.move(low, elastic.elastic_iterations(source, low, warp, schedule))
+        moved.append(error(X[rest], low.X[rest]))
+    assert moved[0] < 0.5 * moved[1], moved
+
+
 def test_local_iterations_fit_a_bump_outside_the_span_of_the_basis(pair):
     template, _, _ = pair
     low = template.low
