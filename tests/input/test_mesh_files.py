@@ -366,6 +366,13 @@ def test_a_second_mesh_in_a_file_is_named(tmp_path):
     for more in ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "3 0 1 2\n"):
         with pytest.raises(ValueError, match=r"found \d more lines than its counts say"):
             read_mesh(file(tmp_path, "m.off", f"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n{more}"))
+    faces = b"element face 1\nproperty list uchar int vertex_indices\n"
+    twice = ply("ascii").replace(b"element face", faces + b"element face")
+    with pytest.raises(ValueError, match="one mesh expected, found two elements 'face'"):
+        read_mesh(file(tmp_path, "m.ply", twice))
+    np.savez(tmp_path / "m.npz", V=X, F=T, vertices=X, faces=T)
+    with pytest.raises(ValueError, match="V, F, vertices, faces: write each mesh to a file of its"):
+        read_mesh(tmp_path / "m.npz")
 
 
 def test_text_in_utf_16_is_named(tmp_path):
