@@ -101,6 +101,9 @@ def test_labels_and_landmarks_of_a_moved_and_renumbered_copy_are_exact(meshes, m
         assert distance(image["image_position"].values, X[true]).max() < 1e-4 * size
         corner = image["image_barycentric"].values.argmax(1)
         assert (T[image["image_triangle"].values, corner] == true).all()
+    lacking = study.filter(lambda node: node.path != "/original/target")
+    with pytest.raises(ValueError, match="meshes of the shapes are needed; /original lacks target"):
+        correspondence(lacking, "source", "target")
     landmarks = mesh[["landmark_name", "landmark_position"]]
     marks = transfer_landmarks(study, landmarks)["source"]
     exact = locate(landmarks, mesh)["landmark_position"].values @ R.T + [30, -20, 5]
@@ -428,7 +431,11 @@ def test_an_invalid_row_is_named_with_its_line(tmp_path, read, text, said):
         read(tmp_path / "rows.csv")
 
 
-def test_empty_cells_behind_a_row_and_comments_change_no_landmark(tmp_path):
+def test_empty_cells_behind_a_row_and_comments_change_no_landmark(tmp_path, caplog):
+    (tmp_path / "points.csv").write_text("name,x,y,z\n# by hand, twice\n#1,1,2,3\nb,4,5,6\n")
+    assert read_landmarks(tmp_path / "points.csv").sizes["landmark"] == 1
+    assert "rows that begin with # are skipped as comments: #1,1,2,3" in caplog.text
+    assert "by hand" not in caplog.text
     (tmp_path / "points.csv").write_text("name,x,y,z,note\n# by hand\na,1,2,3,,\nb,4,5,6\n")
     found = read_landmarks(tmp_path / "points.csv")["landmark_position"].values
     assert found.tolist() == [[1, 2, 3], [4, 5, 6]]
