@@ -131,8 +131,14 @@ def as_flags(message: str, flags: Iterable[str]) -> str:
 
 def once() -> Callable[[logging.LogRecord], bool]:
     """Return a filter that passes every message once: several steps may find the same."""
-    seen: dict[str, logging.LogRecord] = {}
-    return lambda record: seen.setdefault(record.getMessage(), record) is record
+    seen: set[str] = set()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        is_known = (message := record.getMessage()) in seen
+        seen.add(message)
+        return not is_known
+
+    return is_new
 
 
 def main(arguments: list[str] | None = None) -> int:
