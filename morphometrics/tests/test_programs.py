@@ -325,6 +325,18 @@ def test_files_without_a_frame_are_reported_for_slicer(study, tmp_path, caplog):
     assert b"SPACE" not in (tmp_path / f"{name}.vtk").read_bytes()[:200]
 
 
+def test_axes_that_slicer_does_not_read_are_converted(study, tmp_path):
+    other = study.copy(deep=True)
+    name = str(other["registration"]["shape"].values[0])
+    other["original"][name].attrs["coordinate_system"] = "LAS"
+    write_for(other, tmp_path, "slicer", n_points=5)
+    X, _, attrs = read_mesh(tmp_path / f"{name}.vtk")
+    assert attrs["coordinate_system"] == "RAS"
+    data = study["registration"].to_dataset()
+    known = image_in_shape(data["position"].values, data.sel(shape=name))
+    assert X == pytest.approx(known * [-1, 1, 1], abs=1e-5)
+
+
 def test_a_mirrored_shape_is_written_in_the_frame_of_its_file(study, tmp_path):
     mirrored = study.copy(deep=True)
     name = study["registration"]["shape"].values[1]

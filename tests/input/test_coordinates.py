@@ -321,6 +321,18 @@ def test_landmarks_that_fit_a_mesh_in_two_directions_are_reported(caplog):
     assert not caplog.text
 
 
+def test_a_landmark_file_that_states_the_wrong_system_is_reported(caplog):
+    both = as_dataset(np.r_[X, 1.08 * X * [-1, -1, 1]], np.r_[T, T + len(X)])  # fits in both
+    both = both.assign_attrs(system("RAS").attrs, path="a.ply")
+    for axes in ("RAS", "LPS"):
+        points = {"landmark_name": list("ab"), "landmark_position": X[[3, 40]]}
+        found = locate(dataset(system(axes).attrs, **points), both)
+        assert ("a.ply: the landmarks are in LPS, mm, the mesh in RAS" in caplog.text) == (
+            axes == "LPS"
+        )
+    assert found["landmark_distance"].values.max() > 0.1  # as stated, nevertheless
+
+
 def test_landmark_files_of_other_programs_are_read(tmp_path, caplog):
     P, names = np.array([[1.5, 2, 3], [-4, 5.25, 6]]), ["a", "b"]
     rows = list(zip(range(2), *P.T.tolist(), names, strict=True))

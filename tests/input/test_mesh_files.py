@@ -543,4 +543,9 @@ def test_other_files_of_a_folder_are_skipped_and_named(tmp_path):
         ("scores.npz", "an archive of other arrays")
     ]
     assert [path.name for path, _ in not_meshes(tmp_path / "*")] == ["a.json", "scores.npz"]
+    (tmp_path / "volumes").mkdir()
+    (tmp_path / "volumes/a.nii").touch()
+    assert (tmp_path / "volumes", "a folder without meshes") in not_meshes(
+        [tmp_path, tmp_path / "volumes"]
+    )
     assert not_meshes(tmp_path, "a") == []

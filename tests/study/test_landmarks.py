@@ -174,6 +174,22 @@ def test_a_study_keeps_its_landmarks_and_says_who_has_none(store):
     assert "brain_04" in study["report"].attrs["remarks"]
 
 
+def test_landmarks_that_are_not_paired_are_named(marked, store, tmp_path):
+    meshes, folder = marked
+    own = shutil.copytree(folder, tmp_path / "marks")
+    text = (own / "brain_02.csv").read_text()
+    (own / "brain_02.csv").write_text(text.replace("\na,", "\nA,"))
+    shutil.copytree(store, tmp_path / "study")
+    study = analyse(meshes, landmarks=own, store=tmp_path / "study", **OPTIONS)
+    said = "landmarks without a partner of that name are ignored (brain_02: A)"
+    assert said in study["report"].attrs["remarks"]
+    assert "partner" not in open_study(store)["report"].attrs["remarks"]
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new/brain_05.csv").write_text(text.replace("\na,", "\nA,"))
+    new = insert(study, {"brain_05": meshes["brain_02"]}, landmarks=tmp_path / "new")
+    assert "are ignored (brain_05: A)" in new["report"].attrs["remarks"]
+
+
 def test_a_changed_landmark_file_recomputes_its_shape_only(marked, store, tmp_path):
     meshes, folder = marked
     own = shutil.copytree(folder, tmp_path / "marks")
