@@ -684,7 +684,7 @@ def report_centred(study: xr.DataTree, names: list[str], shapes: list[str]) -> N
         meshes = part["original"].children if "original" in part.children else {}
         if shape not in meshes or "position" not in meshes[shape].data_vars:
             return
-        mesh = meshes[shape]
+        mesh = meshes[shape].dataset
         X = moved(mesh["position"].values, map_to_file(mesh.attrs))
         middles = np.stack([X.mean(0), (X.min(0) + X.max(0)) / 2])
         far.append(np.linalg.norm(middles, axis=1) / np.ptp(X, axis=0).max())
