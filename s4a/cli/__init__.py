@@ -131,14 +131,8 @@ def as_flags(message: str, flags: Iterable[str]) -> str:
 
 def once() -> Callable[[logging.LogRecord], bool]:
     """Return a filter that passes every message once: several steps may find the same."""
-    seen: set[str] = set()
-
-    def is_new(record: logging.LogRecord) -> bool:
-        is_known = (message := record.getMessage()) in seen
-        seen.add(message)
-        return not is_known
-
-    return is_new
+    seen: dict[str, float] = {}  # message -> when it was logged first
+    return lambda record: seen.setdefault(record.getMessage(), record.created) == record.created
 
 
 def main(arguments: list[str] | None = None) -> int:

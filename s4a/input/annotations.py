@@ -206,10 +206,9 @@ def table_rows(text: str) -> dict[int, list[str]]:
         raise ValueError("the file is empty")
     numbers, texts = list(lines), list(lines.values())
     mark = next((mark for mark in ",;\t" if mark in texts[0]), " ")
-    comments = [line for line in text.splitlines() if line.startswith("#") and mark in line.strip()]
-    rows_like = [line for line in comments if line.count(mark) == texts[0].count(mark)]
-    if rows_like and mark != " ":
-        log.warning("rows that begin with # are skipped as comments: %s", shown(rows_like[0][:60]))
+    for line in text.splitlines():
+        if line[:1] == "#" and line.count(mark) == texts[0].count(mark) > 0 and mark != " ":
+            log.warning("a row that begins with # is skipped as a comment: %s", shown(line[:60]))
     rows = {}
     for row in (reader := csv.reader(texts, delimiter=mark, skipinitialspace=True)):
         cells = (cell.strip() for cell in row)
@@ -469,11 +468,9 @@ _SET = {"positionstatus": ("", "2", "defined"), "defined": ("", *_TRUE)}
 
 def _table_points(text):
     columns = re.compile(r"(?m)^#\s*columns\s*=\s*")
-    stated = {
-        "coordinate system": r"(?:SPACE|CoordinateSystem)\s*=\s*(\w+)",
-        "unit": r"UNIT\s*=\s*(um|mm|cm|m|in)\b",
-    }
-    axes, unit = (only(w, re.findall(rf"(?m)^#.*?\b{one}", text)) for w, one in stated.items())
+    stated = [r"(?:SPACE|CoordinateSystem)\s*=\s*(\w+)", r"UNIT\s*=\s*(um|mm|cm|m|in)\b"]
+    found = [re.findall(rf"(?m)^#.*?\b{one}", text) for one in stated]
+    axes, unit = map(only, ("coordinate system", "unit"), found)
     if columns.search(text):  # .fcsv of 3D Slicer, of old versions without a system, or with 0
         axes, unit = axes or "0", unit or "mm"
     systems, units = [_AXES.get(axes, axes)], [unit]

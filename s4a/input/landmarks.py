@@ -106,26 +106,17 @@ def locate(
             f"{CoordinateSystem.of(landmarks.attrs)}; mesh: {CoordinateSystem.of(mesh.attrs)}; "
             "set coordinate_system= and unit= for files that lack them"
         )
-    of_mesh = f"{shown(mesh.attrs['path'])}: " if mesh.attrs.get("path") else ""
+    others += better if best == KNOWN else []  # files that state the wrong system
     if is_guess or others:
         log.warning(
-            "%sthe coordinate system of the landmarks or of the mesh is unknown: %s fits, with at "
-            "most %.3g from the surface%s; coordinate_system= sets it",
-            of_mesh,
+            "%sthe coordinate system of the landmarks or of the mesh %s: %s fits, with at most "
+            "%.3g from the surface%s; %s",
+            f"{shown(mesh.attrs['path'])}: " if mesh.attrs.get("path") else "",
+            "may be wrong" if best == KNOWN else "is unknown",
             best,
             distance.max(),
             "".join(f", and {name} with {far[name]:.3g}" for name in others),
-        )
-    if best == KNOWN and better:
-        log.warning(
-            "%sthe landmarks are in %s, the mesh in %s, as their files say, but the positions as "
-            "given fit better: at most %.3g from the surface instead of %.3g; correct the file if "
-            "it is wrong",
-            of_mesh,
-            CoordinateSystem.of(landmarks.attrs),
-            CoordinateSystem.of(mesh.attrs),
-            far[GIVEN],
-            far[KNOWN],
+            "correct the file if so" if best == KNOWN else "coordinate_system= sets it",
         )
     return _located(
         surface_point,
@@ -325,17 +316,11 @@ def with_landmarks(
 
 def unpaired(meshes: Mapping[str, xr.Dataset], known: Iterable[str] | None = None) -> list[str]:
     """Remarks on guiding landmarks with a name that no other mesh, or none of `known`, has."""
-    names = {
-        n: mesh["guide_name"].values.tolist() for n, mesh in meshes.items() if "guide_name" in mesh
-    }
+    names = {n: m["guide_name"].values.tolist() for n, m in meshes.items() if "guide_name" in m}
     count = Counter(itertools.chain(*names.values()) if known is None else 2 * list(known))
-    alone = {n: [name for name in found if count[name] < 2] for n, found in names.items()}
-    texts = [f"{n}: {', '.join(found)}" for n, found in alone.items() if found]
-    return (
-        [f"landmarks without a partner of that name are ignored ({'; '.join(texts)})"]
-        if texts
-        else []
-    )
+    alone = {n: ", ".join(x for x in found if count[x] < 2) for n, found in names.items()}
+    texts = "; ".join(f"{n}: {found}" for n, found in alone.items() if found)
+    return [f"landmarks without a partner of that name are ignored ({texts})"] * bool(texts)
 
 
 def guides_of(mesh: xr.Dataset) -> xr.Dataset:

@@ -434,7 +434,7 @@ def test_an_invalid_row_is_named_with_its_line(tmp_path, read, text, said):
 def test_empty_cells_behind_a_row_and_comments_change_no_landmark(tmp_path, caplog):
     (tmp_path / "points.csv").write_text("name,x,y,z\n# by hand, twice\n#1,1,2,3\nb,4,5,6\n")
     assert read_landmarks(tmp_path / "points.csv").sizes["landmark"] == 1
-    assert "rows that begin with # are skipped as comments: #1,1,2,3" in caplog.text
+    assert "a row that begins with # is skipped as a comment: #1,1,2,3" in caplog.text
     assert "by hand" not in caplog.text
     (tmp_path / "points.csv").write_text("name,x,y,z,note\n# by hand\na,1,2,3,,\nb,4,5,6\n")
     found = read_landmarks(tmp_path / "points.csv")["landmark_position"].values
