@@ -107,15 +107,19 @@ def _npz_labels(data, file, name, n):
 
 
 def _gifti_vector(data, intent="LABEL"):
-    """The array of labels, if there is one, or of one dimension."""
+    """The array of labels, if there is one, or of one dimension, in the order of the vertices."""
     arrays = gifti_arrays(data)
+    index = [values for of, values in arrays if of == "NODE_INDEX"]
+    arrays = [(of, values) for of, values in arrays if of != "NODE_INDEX"]
     found = [values for of, values in arrays if of == intent]
     found = found or [values for _, values in arrays if values.ndim == 1]
     if not found:
         raise ValueError("a GIFTI array of one dimension needed, found none")
     if len(found) > 1:
         log.warning("the first of %d arrays of a GIFTI file is used", len(found))
-    return found[0]
+    if index:
+        _check_vertices(index[0])
+    return found[0][np.argsort(index[0])] if index else found[0]
 
 
 class _Cursor(io.BytesIO):

@@ -38,6 +38,7 @@ from s4a.input.annotations import (
     labels_of_mesh,
     read_labels,
     read_landmarks,
+    read_scalars,
     write_landmarks,
 )
 from s4a.input.landmarks import locate
@@ -344,6 +345,12 @@ def test_every_label_file_gives_the_same_labels(tmp_path):
         darrays=[nibabel.gifti.GiftiDataArray(label.astype(np.int32), "NIFTI_INTENT_LABEL")]
     )
     nibabel.save(gifti, tmp_path / "a.label.gii")
+    order = np.random.default_rng(0).permutation(len(label)).astype(np.int32)
+    arrays = zip((order, label[order].astype(np.int32)), ("NODE_INDEX", "LABEL"), strict=True)
+    gifti.darrays = [nibabel.gifti.GiftiDataArray(a, f"NIFTI_INTENT_{of}") for a, of in arrays]
+    nibabel.save(gifti, tmp_path / "sparse.label.gii")
+    assert (read_labels(tmp_path / "sparse.label.gii", len(label)) == label).all()
+    assert (read_scalars(tmp_path / "sparse.label.gii", "", len(label)) == label).all()
     colours = np.array([[i, i, i, 0, 0] for i in range(1, 7)])
     nibabel.freesurfer.write_annot(
         tmp_path / "lh.annot", label, colours, list("abcdef"), fill_ctab=True
