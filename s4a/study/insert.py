@@ -13,7 +13,7 @@ from s4a.geometry.crossing import can_count
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input import plausibility
 from s4a.input.chirality import AUTO, is_mirrored, mirror_image
-from s4a.input.collection import shape_report
+from s4a.input.collection import remarks_on_files, shape_report
 from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.files import SUFFIXES as MESHES
 from s4a.input.files import files_named, suffix_of
@@ -267,6 +267,8 @@ def read_new(
     """Read the usable new meshes, with landmarks and fields, and attributes for the report."""
     volumes = options.label is not None and (isinstance(shapes, dict) or not _are_meshes(shapes))
     sources = find_sources(shapes, volumes=volumes)
+    for remark in remarks_on_files(shapes, volumes=volumes):
+        log.warning("%s", remark)
     cleaning = options.of("cleaning")
     if options.label is not None and not volumes:  # meshes for a study of label volumes
         cleaning = cleaning | {"label": None}

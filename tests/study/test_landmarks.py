@@ -246,7 +246,9 @@ def test_landmarks_decide_the_pose_with_every_preset(marked, preset):
         assert np.trace(R.sel(shape="brain_02").values @ turn @ rotation.T) > 2.8
 
 
-def test_the_command_line_takes_them_for_a_study_and_for_new_shapes(marked, tmp_path, capsys):
+def test_the_command_line_takes_them_for_a_study_and_for_new_shapes(
+    marked, tmp_path, capsys, caplog
+):
     meshes, folder = marked
     (tmp_path / "scans").mkdir()
     for name, mesh in meshes.items():
@@ -255,8 +257,11 @@ def test_the_command_line_takes_them_for_a_study_and_for_new_shapes(marked, tmp_
     arguments = ["run", *map(str, files[1:]), "--landmarks", str(folder)]
     assert cli.main([*arguments, "--out", str(tmp_path / "study"), *FLAGS]) == 0
     assert "no landmark file" in capsys.readouterr().out
-    arguments = ["insert", str(tmp_path / "study"), str(files[0]), "--landmarks", str(folder)]
-    assert cli.main([*arguments, "--out", str(tmp_path / "new")]) == 0
+    (tmp_path / "other").mkdir()
+    arguments = ["insert", str(tmp_path / "study"), str(files[0]), str(tmp_path / "other")]
+    arguments += ["--landmarks", str(folder), "--out", str(tmp_path / "new")]
+    assert cli.main(arguments) == 0
+    assert "other is not a mesh (a folder without meshes) and was skipped" in caplog.text
     study = open_study(tmp_path / "study")
     new = insert(study, [files[0]], landmarks=folder)
     assert new["original/brain_01"]["guide_name"].values.tolist() == list("abcd")
