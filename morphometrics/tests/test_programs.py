@@ -540,13 +540,19 @@ def test_every_program_needs_a_registered_study(brains, tmp_path):
             write_for(brains, tmp_path, program)
 
 
-def test_a_grid_elsewhere_is_refused_with_the_position_of_the_surface(scans, tmp_path):
+def test_a_grid_elsewhere_is_refused_with_the_position_of_the_surface(scans, tmp_path, caplog):
     _, study = scans
     far = AFFINE.copy()
     far[:3, 3] += 5000
     nibabel.save(nibabel.Nifti1Image(np.zeros((9, 9, 9), np.uint8), far), tmp_path / "far.nii")
     with pytest.raises(ValueError, match=r"no voxel of .*far.nii is inside scan_0, .* mm \(RAS\)"):
         write_for(study, tmp_path, "nifti", label=sides(study), grid=tmp_path / "far.nii")
+    assert "cut off" not in caplog.text
+    half = nibabel.Nifti1Image(np.zeros((14, 28, 28), np.uint8), AFFINE)
+    nibabel.save(half, tmp_path / "half.nii")
+    write_for(study, tmp_path, "nifti", label=sides(study), grid=tmp_path / "half.nii")
+    assert "scan_0 is cut off: " in caplog.text
+    assert f"% lie outside of {tmp_path / 'half.nii'}" in caplog.text
 
 
 def test_the_command_exports_and_refuses_unknown_options(study_folder, study, tmp_path, capsys):
