@@ -57,7 +57,7 @@ def _parse_vtk(data):
     points, cells = None, []
     while words := file.line():
         section = words[0].upper()
-        if section == b"POINTS":
+        if section == b"POINTS" and points is None:
             points = file.values(3 * int(words[1]), words[2]).reshape(-1, 3)
         elif section in (b"POLYGONS", b"TRIANGLE_STRIPS", b"LINES", b"VERTICES"):
             found = file.polygons(int(words[1]), int(words[2]))

@@ -363,6 +363,10 @@ def test_a_second_mesh_in_a_file_is_named(tmp_path):
     write_mesh(tmp_path / "m.vtk", X, T, x=X[:, 0])
     with pytest.raises(ValueError, match=r"one mesh expected, found a second VTK at byte \d+"):
         read_mesh(file(tmp_path, "m.vtk", 2 * (tmp_path / "m.vtk").read_bytes()))
+    write_mesh(tmp_path / "m.vtk", X, T)
+    one = (tmp_path / "m.vtk").read_bytes()
+    with pytest.raises(ValueError, match="a section of polydata expected, found b'POINTS'"):
+        read_mesh(file(tmp_path, "m.vtk", one + one[one.index(b"POINTS") :]))
     for more in ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "3 0 1 2\n"):
         with pytest.raises(ValueError, match=r"found \d more lines than its counts say"):
             read_mesh(file(tmp_path, "m.off", f"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n{more}"))
