@@ -30,7 +30,7 @@ _MARKUPS = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/"
     "Resources/Schema/markups-schema-v1.0.3.json#"
 )
-_FORMULA = r"[=+@\t\r-]."  # the beginning of a cell that a spreadsheet evaluates
+_FORMULA = r"[=+@\t\r#-]."  # the beginning of a formula of a spreadsheet, or of a comment
 
 
 def read_labels(path: Path | str, n: int | None = None) -> Array:
@@ -223,7 +223,7 @@ def table_rows(text: str) -> dict[int, list[str]]:
 def write_rows(path: Path, rows: Iterable[Iterable[Any]]) -> Path:
     """Write a CSV file and return its path.
 
-    A text that a spreadsheet would take for a formula gets an apostrophe, which
+    A text that would be a formula of a spreadsheet or a comment gets an apostrophe, which
     :func:`table_rows` removes.
 
     Examples

@@ -402,6 +402,12 @@ def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
 
 def test_landmarks_are_written_as_a_table_and_other_tables_are_refused(tmp_path):
     points = dataset(landmark_name=["a", "b"], landmark_position=[[1.5, 2, 3], [-4, 5.25, 6]])
+    numbered = points.assign(landmark_name=("landmark", ["#1", "#2"]))
+    write_landmarks(tmp_path / "numbered.csv", numbered)
+    assert read_landmarks(tmp_path / "numbered.csv")["landmark_name"].values.tolist() == [
+        "#1",
+        "#2",
+    ]
     write_landmarks(tmp_path / "out.csv", points)
     rows = ["name,x,y,z", "a,1.5,2.0,3.0", "b,-4.0,5.25,6.0"]
     assert (tmp_path / "out.csv").read_text().split() == rows
