@@ -48,6 +48,7 @@ log = logging.getLogger(__name__)
 
 TESTED_SHARE = 0.45  # smallest present share for which the intervals were validated
 LEAST_INSIDE = 0.6  # smallest share of the partial shape on the complete one
+LARGEST_AREA = 4.0  # of a partial shape, relative to the template
 SURELY_INSIDE = 0.95  # below this share, more rotations are tried
 FOREIGN = 1.4  # residual, relative to the largest of a shape of the study
 N_AGAIN = 48  # initialisations if the modes do not fit
@@ -152,7 +153,7 @@ def complete(
     partial = part_of(*as_arrays(mesh))
     usual = usual_pose(study, model)
     fit, whole = fit_part(partial, model, usual, mesh)
-    check_fit(fit, model)
+    check_fit(fit, partial)
     low, present, fit = match(partial, model, whole, fit)
     share = float(model.area @ present)
     if share < LEAST_SHARE:
@@ -256,13 +257,15 @@ def pose_of_landmarks(mesh: xr.Dataset, model: Model, mean: np.ndarray, usual: P
     return Pose(R, Q.mean(0) - usual.s * R @ P.mean(0), usual.s)
 
 
-def check_fit(fit: Fit, model: Model) -> None:
+def check_fit(fit: Fit, part: Part) -> None:
     """Raise ValueError if a partial shape does not fit the shapes of the study."""
-    if fit.inside < LEAST_INSIDE:
+    area = fit.pose.s**2 * part.area.sum()  # relative to that of the template
+    if fit.inside < LEAST_INSIDE or area > LARGEST_AREA:
         raise ValueError(
             f"the partial shape does not fit the study: {100 * fit.inside:.0f} % of it lies on "
-            "the best fit. Is it another kind of shape, or in another unit? Three "
-            "landmarks in common with the template fix its pose (landmarks=)"
+            f"the best fit, and its area is {area:.2g} times that of the template. Is it another "
+            "kind of shape, or in another unit? Three landmarks in common with the template fix "
+            "its pose (landmarks=)"
         )
 
 

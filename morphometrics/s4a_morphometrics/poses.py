@@ -19,6 +19,7 @@ ShapeWorks, Iyer et al. 2022, whose poses are the positions of the centres only;
 several resolutions Cerrolaza et al. 2015).  A structure is weighted by its area.
 """
 
+import itertools
 import logging
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -290,6 +291,7 @@ def structures(
         for (X, T), length in zip(meshes, lengths, strict=True)
     ]
     report_frames(names, Y, areas)
+    report_centred(study, names, shapes)
     counts = [len(area) for area in areas]
     vertices = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
     area = np.concatenate(areas)
@@ -672,6 +674,26 @@ def report_frames(names: list[str], Y: list[np.ndarray], areas: list[np.ndarray]
                 names[0],
                 names[k],
             )
+
+
+def report_centred(study: xr.DataTree, names: list[str], shapes: list[str]) -> None:
+    """Warn if the vertices of every file have their mean, or their middle, at the origin."""
+    far = []
+    for name, shape in itertools.product(names, shapes):
+        part = of_structure(study, name)
+        meshes = part["original"].children if "original" in part.children else {}
+        if shape not in meshes or "position" not in meshes[shape].data_vars:
+            return
+        mesh = meshes[shape].dataset
+        X = moved(mesh["position"].values, map_to_file(mesh.attrs))
+        middles = np.stack([X.mean(0), (X.min(0) + X.max(0)) / 2])
+        far.append(np.linalg.norm(middles, axis=1) / np.ptp(X, axis=0).max())
+    if (np.max(far, axis=0) < SAME_CENTRE).any():
+        log.warning(
+            "every file of %s has its centre at the origin: were they centred one by one? Then "
+            "their relative pose is lost",
+            listed(names),
+        )
 
 
 def report_poses(

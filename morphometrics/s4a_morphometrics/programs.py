@@ -151,7 +151,7 @@ def write_slicer(
     names = np.array([str(vertex) for vertex in chosen.tolist()])
     for shape in registration["shape"].values.tolist():
         registered = registration.sel(shape=shape)
-        M, system = map_to_scan(study, shape, given, "mm")
+        M, system = map_to_scan(study, shape, given, slicer=True)
         points = moved(image_in_shape(X, registered), M)
         triangles = turned(T, M)
         unknown += [] if system.axes else [shape]

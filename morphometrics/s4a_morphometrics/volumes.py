@@ -3,6 +3,7 @@
 A voxel whose centre is inside a shape gets the label of its nearest vertex.
 """
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from s4a.input.coordinates import CoordinateSystem, file_system, map_between, mo
 from s4a.input.labels import read_grid, voxels_marked
 from s4a.input.raw import new_folder
 from s4a.schema import Array
+
+log = logging.getLogger(__name__)
 
 VOLUMES = ("NIfTI", "MGH", "NRRD")
 
@@ -153,6 +156,10 @@ def _volume(mesh, M, name, label, grid, source_label):
                 f"{_as_text(Y.min(0))} to {_as_text(Y.max(0))} mm (RAS): give the scan of this "
                 "shape"
             )
+        index = (Y - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
+        outside = ((index < -0.5) | (index > np.array(shape) - 0.5)).any(axis=1).mean()
+        if outside:
+            log.warning("%s is cut off: %.1f %% lie outside of %s", name, 100 * outside, grid)
     values = np.zeros(shape, np.int32)
     values[tuple(voxel.T)] = label[cKDTree(Y).query(centre)[1]]
     return values, affine

@@ -274,6 +274,8 @@ def test_invalid_parts_are_refused_with_the_reason(study, brain, tmp_path):
         complete(xr.DataTree.from_dict(nodes), brain)
     with pytest.raises(ValueError, match="the partial shape does not fit the study"):
         complete(study, (0.05 * X, T))
+    with pytest.raises(ValueError, match=r"and its area is \d+ times that of the template"):
+        complete(study, (10 * X, T))
 
 
 def test_a_part_of_another_bone_is_refused_or_named(study, brain, caplog):

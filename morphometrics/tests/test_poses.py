@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import s4a
 from s4a import statistics
-from s4a.geometry.mesh import vertex_areas
+from s4a.geometry.mesh import as_dataset, vertex_areas
 from s4a.input.coordinates import CoordinateSystem, transform
 from s4a.input.subjects import subjects as table_of
 from s4a.schema import dataset, in_unit
@@ -239,6 +239,19 @@ def test_structures_that_do_not_fit_together_are_reported(fault, words, caplog):
     fault(Y)
     structures(tree_of(Y), **FEW)
     assert all(word in caplog.text for word in words)
+
+
+@pytest.mark.parametrize("middle", [lambda X: X.mean(0), lambda X: (X.min(0) + X.max(0)) / 2])
+def test_files_that_were_centred_one_by_one_are_reported(middle, caplog):
+    Y = drawn(9, pose=1, shape=1)
+    for centred in (False, True):
+        nodes = tree_of(Y).to_dict()
+        for i, k in np.ndindex(Y.shape[:2]):
+            X = Y[i, k] - (middle(Y[i, k]) if centred else 0)
+            mesh = in_unit(as_dataset(X, T), "mm").assign_attrs(unit="mm")
+            nodes[f"/structures/{NAMES[k]}/original/s{i:02d}"] = mesh
+        structures(xr.DataTree.from_dict(nodes), **FEW)
+        assert ("every file of left, right has its centre at the origin" in caplog.text) == centred
 
 
 def test_usual_poses_are_not_reported(caplog):

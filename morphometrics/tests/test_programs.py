@@ -325,6 +325,18 @@ def test_files_without_a_frame_are_reported_for_slicer(study, tmp_path, caplog):
     assert b"SPACE" not in (tmp_path / f"{name}.vtk").read_bytes()[:200]
 
 
+def test_axes_that_slicer_does_not_read_are_converted(study, tmp_path):
+    other = study.copy(deep=True)
+    name = str(other["registration"]["shape"].values[0])
+    other["original"][name].attrs["coordinate_system"] = "LAS"
+    write_for(other, tmp_path, "slicer", n_points=5)
+    X, _, attrs = read_mesh(tmp_path / f"{name}.vtk")
+    assert attrs["coordinate_system"] == "RAS"
+    data = study["registration"].to_dataset()
+    known = image_in_shape(data["position"].values, data.sel(shape=name))
+    assert X == pytest.approx(known * [-1, 1, 1], abs=1e-5)
+
+
 def test_a_mirrored_shape_is_written_in_the_frame_of_its_file(study, tmp_path):
     mirrored = study.copy(deep=True)
     name = study["registration"]["shape"].values[1]
@@ -528,13 +540,19 @@ def test_every_program_needs_a_registered_study(brains, tmp_path):
             write_for(brains, tmp_path, program)
 
 
-def test_a_grid_elsewhere_is_refused_with_the_position_of_the_surface(scans, tmp_path):
+def test_a_grid_elsewhere_is_refused_with_the_position_of_the_surface(scans, tmp_path, caplog):
     _, study = scans
     far = AFFINE.copy()
     far[:3, 3] += 5000
     nibabel.save(nibabel.Nifti1Image(np.zeros((9, 9, 9), np.uint8), far), tmp_path / "far.nii")
     with pytest.raises(ValueError, match=r"no voxel of .*far.nii is inside scan_0, .* mm \(RAS\)"):
         write_for(study, tmp_path, "nifti", label=sides(study), grid=tmp_path / "far.nii")
+    assert "cut off" not in caplog.text
+    half = nibabel.Nifti1Image(np.zeros((14, 28, 28), np.uint8), AFFINE)
+    nibabel.save(half, tmp_path / "half.nii")
+    write_for(study, tmp_path, "nifti", label=sides(study), grid=tmp_path / "half.nii")
+    assert "scan_0 is cut off: " in caplog.text
+    assert f"% lie outside of {tmp_path / 'half.nii'}" in caplog.text
 
 
 def test_the_command_exports_and_refuses_unknown_options(study_folder, study, tmp_path, capsys):

@@ -132,7 +132,7 @@ def system_of_template(study: xr.DataTree, name: str) -> CoordinateSystem:
 
 
 def map_to_scan(
-    study: xr.DataTree, name: str, given: CoordinateSystem | None = None, unit: str = ""
+    study: xr.DataTree, name: str, given: CoordinateSystem | None = None, *, slicer: bool = False
 ) -> tuple[Array, CoordinateSystem]:
     """Return the map (4, 4) of a shape to its file, or to scanner RAS, and that system.
 
@@ -142,12 +142,12 @@ def map_to_scan(
     name : str
     given : CoordinateSystem, optional
         For files that state none.
-    unit : str
-        Unit to convert to, if that of the file is known.
+    slicer : bool
+        For 3D Slicer: in millimetres, and in RAS unless it is LPS, as far as they are known.
     """
     attrs = _attrs_of(study, name)
     system = file_system(attrs).filled(given or CoordinateSystem())
-    written = system.in_world(unit=unit)
+    written = system.in_world(*["LPS" if system.axes == "LPS" else "RAS", "mm"] if slicer else [])
     return map_between(system, written, name) @ map_to_file(attrs), written
 
 

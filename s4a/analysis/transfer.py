@@ -31,6 +31,7 @@ from s4a.geometry.closest import (
 from s4a.geometry.mesh import as_arrays, stiffness, vertex_areas, vertex_normals
 from s4a.input.coordinates import CoordinateSystem, in_one_system
 from s4a.input.landmarks import FARTHEST_LANDMARK, NAMED, as_landmarks, locate, trace_curves
+from s4a.input.subjects import listed
 from s4a.method.register import common_unit, identity, uncertainty
 from s4a.method.remesh import laplacian
 from s4a.method.shape import Shape
@@ -307,6 +308,10 @@ def plan(
         check_choice("target", name, names)
     for one in inside:
         check_choice("source", one, [*names, template])
+    meshes = study["original"].children if "original" in study.children else ()
+    needed = dict.fromkeys([template, *inside, *targets])
+    if absent := [name for name in needed if name not in meshes]:
+        raise ValueError(f"the meshes of the shapes are needed; /original lacks {listed(absent)}")
     starts = [_start(study, one, options or {}) for one, _ in pairs]
 
     def routes_to_targets():

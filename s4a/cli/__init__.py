@@ -131,8 +131,8 @@ def as_flags(message: str, flags: Iterable[str]) -> str:
 
 def once() -> Callable[[logging.LogRecord], bool]:
     """Return a filter that passes every message once: several steps may find the same."""
-    seen: dict[str, logging.LogRecord] = {}
-    return lambda record: seen.setdefault(record.getMessage(), record) is record
+    seen: dict[str, float] = {}  # message -> when it was logged first
+    return lambda record: seen.setdefault(record.getMessage(), record.created) == record.created
 
 
 def main(arguments: list[str] | None = None) -> int:

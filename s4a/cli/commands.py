@@ -479,6 +479,8 @@ def registered_pairs(
     shapes = s4a.read_shapes(targets, compare=False)
     report = shapes["report"].to_dataset()
     excluded = report["shape"].values[report["status"].values == "excluded"].tolist()
+    for remark in report.attrs["remarks"].splitlines():
+        write(remark)
     for name in excluded:
         write(f"{name} excluded: {report['reason'].sel(shape=name).item()}")
     meshes = {name: node.to_dataset() for name, node in shapes["original"].children.items()}

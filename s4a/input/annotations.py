@@ -30,7 +30,7 @@ _MARKUPS = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/"
     "Resources/Schema/markups-schema-v1.0.3.json#"
 )
-_FORMULA = r"[=+@\t\r-]."  # the beginning of a cell that a spreadsheet evaluates
+_FORMULA = r"[=+@\t\r#-]."  # the beginning of a formula of a spreadsheet, or of a comment
 
 
 def read_labels(path: Path | str, n: int | None = None) -> Array:
@@ -107,15 +107,19 @@ def _npz_labels(data, file, name, n):
 
 
 def _gifti_vector(data, intent="LABEL"):
-    """The array of labels, if there is one, or of one dimension."""
+    """The array of labels, if there is one, or of one dimension, in the order of the vertices."""
     arrays = gifti_arrays(data)
+    index = [values for of, values in arrays if of == "NODE_INDEX"]
+    arrays = [(of, values) for of, values in arrays if of != "NODE_INDEX"]
     found = [values for of, values in arrays if of == intent]
     found = found or [values for _, values in arrays if values.ndim == 1]
     if not found:
         raise ValueError("a GIFTI array of one dimension needed, found none")
     if len(found) > 1:
         log.warning("the first of %d arrays of a GIFTI file is used", len(found))
-    return found[0]
+    if index:
+        _check_vertices(index[0])
+    return found[0][np.argsort(index[0])] if index else found[0]
 
 
 class _Cursor(io.BytesIO):
@@ -206,6 +210,9 @@ def table_rows(text: str) -> dict[int, list[str]]:
         raise ValueError("the file is empty")
     numbers, texts = list(lines), list(lines.values())
     mark = next((mark for mark in ",;\t" if mark in texts[0]), " ")
+    for line in text.splitlines():
+        if line[:1] == "#" and line.count(mark) == texts[0].count(mark) > 0 and mark != " ":
+            log.warning("a row that begins with # is skipped as a comment: %s", shown(line[:60]))
     rows = {}
     for row in (reader := csv.reader(texts, delimiter=mark, skipinitialspace=True)):
         cells = (cell.strip() for cell in row)
@@ -216,7 +223,7 @@ def table_rows(text: str) -> dict[int, list[str]]:
 def write_rows(path: Path, rows: Iterable[Iterable[Any]]) -> Path:
     """Write a CSV file and return its path.
 
-    A text that a spreadsheet would take for a formula gets an apostrophe, which
+    A text that would be a formula of a spreadsheet or a comment gets an apostrophe, which
     :func:`table_rows` removes.
 
     Examples
@@ -466,8 +473,8 @@ _SET = {"positionstatus": ("", "2", "defined"), "defined": ("", *_TRUE)}
 def _table_points(text):
     columns = re.compile(r"(?m)^#\s*columns\s*=\s*")
     stated = [r"(?:SPACE|CoordinateSystem)\s*=\s*(\w+)", r"UNIT\s*=\s*(um|mm|cm|m|in)\b"]
-    found = [re.search(rf"(?m)^#.*?\b{one}", text) for one in stated]
-    axes, unit = (one[1] if one else "" for one in found)
+    found = [re.findall(rf"(?m)^#.*?\b{one}", text) for one in stated]
+    axes, unit = map(only, ("coordinate system", "unit"), found)
     if columns.search(text):  # .fcsv of 3D Slicer, of old versions without a system, or with 0
         axes, unit = axes or "0", unit or "mm"
     systems, units = [_AXES.get(axes, axes)], [unit]

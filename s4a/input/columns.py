@@ -193,7 +193,9 @@ def _is_code(code, rest, count):
     extent = (high - low) * (1 + 4 / len(rest))  # the extent of few values is uncertain
     if code < 0 <= low:
         is_far = low >= max(5, -code) or gap > max(3, 2 * extent)
-        return code < -10 or is_far or (len(rest) > 3 and code < -1 and decimals > 0.75)
+        is_few = low >= 1 and len(np.unique(rest)) <= min(4, len(rest) / 2)  # categories
+        is_alone = len(rest) > 4 and (code < -1 or is_few)
+        return code < -10 or is_far or is_alone or (len(rest) > 3 and code < -1 and decimals > 0.75)
     if abs(code) > 99 and len(rest) > 4 and decimals == (code % 1 == 0):
         return True  # the only integer, or the only decimal
     if count > 1:

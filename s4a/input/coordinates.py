@@ -357,22 +357,25 @@ def _of_volume(x, y, z, c):
 
 def _of_gifti(data):
     """RAS in mm; the space of the points, their map to scanner RAS, or FreeSurfer's VolGeom."""
-    root, maps = xml(data), {}
+    root, maps, spaces = xml(data), {}, []
     points = root.find("DataArray[@Intent='NIFTI_INTENT_POINTSET']")
     points = root if points is None else points
     for node in points.iter("CoordinateSystemTransformMatrix"):
         texts = [node.findtext(tag) or "" for tag in ("DataSpace", "TransformedSpace")]
-        here, there = (SPACES.get(t.strip().removeprefix("NIFTI_XFORM_"), 0) for t in texts)
-        if here:  # Connectome Workbench writes Talairach into every file, whatever its space
-            return CoordinateSystem("RAS", UNKNOWN if here == 3 else XFORMS.get(here, ""), "mm")
-        maps[there] = (node.findtext("MatrixData") or "").split()
+        here, there = (text.strip().removeprefix("NIFTI_XFORM_") for text in texts)
+        spaces.append(here if here in SPACES else "")
+        matrix = [float(word) for word in (node.findtext("MatrixData") or "").split()]
+        maps.setdefault(SPACES.get(there), []).append(matrix)
+    if space := SPACES.get(only("DataSpace", spaces)):
+        # Connectome Workbench writes Talairach into every file, whatever its space
+        return CoordinateSystem("RAS", UNKNOWN if space == 3 else XFORMS.get(space, ""), "mm")
     meta = {m.findtext("Name"): m.findtext("Value") for m in root.iter("MD")}
     geometry = [[meta.get(f"VolGeom{a}_{b}") for b in "RAS"] for a in "XYZC"]
-    to_scanner = maps.get(1, maps.get(2, ()))
-    found = [surface_system(to_scanner[:12])] if len(to_scanner) == 16 else []
+    to_scanner = maps.get(1) or maps.get(2) or []
+    found = [surface_system(M[:12]) for M in to_scanner if M[12:] == [0, 0, 0, 1]]
     if all(word for row in geometry for word in row):
         found.append(_of_volume(*np.array(geometry, float)))
     numbers = np.array([s.to_scanner for s in found], float)
     if len({s.axes for s in found}) == 1 and np.ptp(numbers, axis=0).max() < 1e-3:
         return found[-1]
-    return CoordinateSystem("RAS", UNKNOWN, "mm")  # nothing, or two that differ
+    return CoordinateSystem("RAS", UNKNOWN, "mm")  # nothing, or several that differ

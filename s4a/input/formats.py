@@ -57,7 +57,7 @@ def _parse_vtk(data):
     points, cells = None, []
     while words := file.line():
         section = words[0].upper()
-        if section == b"POINTS":
+        if section == b"POINTS" and points is None:
             points = file.values(3 * int(words[1]), words[2]).reshape(-1, 3)
         elif section in (b"POLYGONS", b"TRIANGLE_STRIPS", b"LINES", b"VERTICES"):
             found = file.polygons(int(words[1]), int(words[2]))
@@ -519,6 +519,8 @@ def _ply_header(text):
         if words[:1] == ["format"]:
             kind = words[1] if words[1:] else None
         elif words[:1] == ["element"]:
+            if any(words[1] == name for name, _, _ in elements):
+                raise ValueError(f"one mesh expected, found two elements {words[1]!r}: {_REMEDY}")
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
             types = [PLY_TYPES.get(word) for word in words[1:-1] if word != "list"]
@@ -821,11 +823,13 @@ NPZ_KEYS = (
 
 def _read_npz(data):
     arrays = npz(data)
-    keys = next((keys for keys in NPZ_KEYS if set(keys) <= set(arrays)), None)
-    if keys is None:
+    found = [keys for keys in NPZ_KEYS if set(keys) <= set(arrays)]
+    if len(found) != 1:
         wanted = " or ".join(" and ".join(keys) for keys in NPZ_KEYS)
-        found = ", ".join(arrays) or "nothing"
-        raise ValueError(f"the keys {wanted} expected, found a ZIP archive of {found}: unpack it")
+        names = ", ".join(arrays) or "nothing"
+        remedy = "write each mesh to a file of its own" if found else "unpack it"
+        raise ValueError(f"the keys {wanted} expected, found a ZIP archive of {names}: {remedy}")
+    (keys,) = found
     points, triangles = (arrays[key]() for key in keys)
     if triangles.dtype.kind not in "iu":
         raise ValueError(f"integer indices expected in {keys[1]}, found {triangles.dtype}")

@@ -113,6 +113,9 @@ def grid_of(data: bytes) -> tuple[tuple[int, ...], Array, CoordinateSystem]:
     kind, name = _kind_of(data := _as_nifti(data))
     header = kind.header_class.from_fileobj(io.BytesIO(data))
     affine, is_oriented = _affine_of(header, name)
+    raw = kind.header_class.from_fileobj(io.BytesIO(data), check=False)
+    if name == "NIfTI" and not (raw["pixdim"][1:4].all() or raw["sform_code"]):
+        raise ValueError("sizes of voxels needed, found 0 in pixdim: save the volume again")
     codes = [0, 2] if name == "MGH" else [int(header[f"{form}form_code"]) for form in "qs"]
     system = CoordinateSystem(unit="mm")
     if is_oriented:

@@ -1,7 +1,9 @@
 """Landmarks and curves on a surface (6.2, Fig. 7)."""
 
+import itertools
 import logging
 from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,7 +84,7 @@ def locate(
     far = {name: projected[2].max() for name, projected in found.items()}
     given = next(iter(found))
     better = [name for name in far if far[given] > limit / 3 and far[name] < far[given] / 2]
-    best = min(better, key=lambda name: far[name], default=given)
+    best = given if given == KNOWN else min(better, key=lambda name: far[name], default=given)
     surface_point, position, distance = found[best]
     others = [
         name
@@ -104,13 +106,17 @@ def locate(
             f"{CoordinateSystem.of(landmarks.attrs)}; mesh: {CoordinateSystem.of(mesh.attrs)}; "
             "set coordinate_system= and unit= for files that lack them"
         )
+    others += better if best == KNOWN else []  # files that state the wrong system
     if is_guess or others:
         log.warning(
-            "the coordinate system of the landmarks or of the mesh is unknown: %s fits, with at "
-            "most %.3g from the surface%s; coordinate_system= sets it",
+            "%sthe coordinate system of the landmarks or of the mesh %s: %s fits, with at most "
+            "%.3g from the surface%s; %s",
+            f"{shown(mesh.attrs['path'])}: " if mesh.attrs.get("path") else "",
+            "may be wrong" if best == KNOWN else "is unknown",
             best,
             distance.max(),
             "".join(f", and {name} with {far[name]:.3g}" for name in others),
+            "correct the file if so" if best == KNOWN else "coordinate_system= sets it",
         )
     return _located(
         surface_point,
@@ -126,12 +132,12 @@ KNOWN, GIVEN = "the conversion", "the position as given"
 def possible_maps(landmarks: CoordinateSystem, mesh: xr.Dataset) -> dict[str, Array]:
     """Return the maps (4, 4) that can take landmarks to a mesh, by what they assume.
 
-    There is one if both systems are known.  An unknown unit is that of the other.
+    If both systems are known, the first is used.  An unknown unit is that of the other.
     """
     system = CoordinateSystem.of(mesh.attrs)
     known = transform(landmarks, system)
     if known is not None and landmarks.axes:
-        return {KNOWN: known}
+        return {KNOWN: known, GIVEN: np.eye(4)}
     unit = landmarks.unit or system.unit
     L, S = replace(landmarks, unit=unit), replace(system, unit=system.unit or unit)
     if L.axes and S.axes:
@@ -306,6 +312,15 @@ def with_landmarks(
     located = locate(points, mesh)
     guides = {str(name).replace("landmark", "guide"): located[name].values for name in located}
     return mesh.drop_dims("guide", errors="ignore").merge(dataset(None, **guides))
+
+
+def unpaired(meshes: Mapping[str, xr.Dataset], known: Iterable[str] | None = None) -> list[str]:
+    """Remarks on guiding landmarks with a name that no other mesh, or none of `known`, has."""
+    names = {n: m["guide_name"].values.tolist() for n, m in meshes.items() if "guide_name" in m}
+    count = Counter(itertools.chain(*names.values()) if known is None else 2 * list(known))
+    alone = {n: ", ".join(x for x in found if count[x] < 2) for n, found in names.items()}
+    texts = "; ".join(f"{n}: {found}" for n, found in alone.items() if found)
+    return [f"landmarks without a partner of that name are ignored ({texts})"] * bool(texts)
 
 
 def guides_of(mesh: xr.Dataset) -> xr.Dataset:

@@ -342,7 +342,8 @@ def npy(data: bytes) -> np.ndarray:
         ) from error
     if dtype.kind not in "biufU":
         raise ValueError(
-            f"an array of numbers or text, without pickled objects, expected; found {dtype}"
+            "an array of numbers or text expected, found "
+            + ("pickled Python objects, which are not read" if dtype.hasobject else f"{dtype}")
         )
     needed, left = math.prod(shape) * dtype.itemsize, len(data) - file.tell()
     if not dtype.itemsize or min(shape, default=0) < 0 or needed > left:

@@ -20,10 +20,13 @@ log = logging.getLogger(__name__)
 
 # cells without a value, in lower case
 MISSING = ("", "-", "na", "n/a", "nan", "#n/a", "<na>", "null")
-# Cyrillic and Greek letters and dashes that look like Latin letters and the hyphen
+# what looks like Latin letters, straight quotes and the hyphen; spaces and _ are dropped
 _SAME = str.maketrans(
-    "аеорсухіѕјкмнтвΑΒΕΖΗΙΚΜΝΟΡΤΥΧαοινρυχ‐‑‒–—−", "aeopcyxisjkmhtbABEZHIKMNOPTYXaoivpux------"
+    "аеорсухіѕјкмнтвӏԁɑıɡΑΒΕΖΗΙΚΜΝΟΡΤΥΧαοινρυχ’‘ʼ“”‐‑‒–—−",
+    "aeopcyxisjkmhtbldaigABEZHIKMNOPTYXaoivpux'''\"\"------",
+    " _",
 )
+_DIGITS = str.maketrans("oli|", "0111")  # O and 0, l and 1
 _PERSON = re.compile(r"(subject|participant|patient|person)([ _-]?(id|nr|no))?", re.IGNORECASE)
 
 
@@ -271,14 +274,18 @@ def look_alikes(cells: Sequence[str]) -> list[tuple[bool, list[str]]]:
     >>> look_alikes(["a", "A", "b", "b\\u200b"])
     [(False, ['A', 'a']), (True, ['b', 'b\\u200b'])]
     """
-    found = []
     by_look: dict[str, list[str]] = {}
     for cell in sorted({*cells}):
         by_look.setdefault(look(cell), []).append(cell)
-    for variants in by_look.values():
-        if len(variants) > 1:
-            found.append((len({*map(visible, variants)}) < len(variants), variants))
-    return found
+    by_digits: dict[str, list[str]] = {}
+    for key in by_look:
+        by_digits.setdefault(look(key.translate(_DIGITS)), []).append(key)
+    for first, *keys in by_digits.values():
+        if re.search(r"[01|]", "".join([first, *keys])):  # not "Ai" and "Al"
+            for key in keys:
+                by_look[first] += by_look.pop(key)
+    several = [variants for variants in by_look.values() if len(variants) > 1]
+    return [(len({*map(visible, v)}) < len(v), v) for v in several]
 
 
 def look(text: str) -> str:

@@ -134,7 +134,11 @@ def template_vertices(study: xr.DataTree, name: str) -> Array | None:
     located = barycentric(study, name)
     if located is None:
         return None
-    corners, weights = located
+    return nearest_corner(*located)
+
+
+def nearest_corner(corners: Array, weights: Array) -> Array:
+    """Return the vertex nearest to each point, given corners and barycentric weights ``(n, 3)``."""
     return np.take_along_axis(corners, weights.argmax(1)[:, None], axis=1)[:, 0]
 
 

@@ -13,11 +13,11 @@ from s4a.geometry.crossing import can_count
 from s4a.geometry.mesh import as_arrays, vertex_areas
 from s4a.input import plausibility
 from s4a.input.chirality import AUTO, is_mirrored, mirror_image
-from s4a.input.collection import shape_report
+from s4a.input.collection import remarks_on_files, shape_report
 from s4a.input.coordinates import CoordinateSystem, in_axes, with_system
 from s4a.input.files import SUFFIXES as MESHES
 from s4a.input.files import files_named, suffix_of
-from s4a.input.landmarks import SUFFIXES
+from s4a.input.landmarks import SUFFIXES, unpaired
 from s4a.input.plausibility import Flag, find_warnings
 from s4a.input.subjects import listed
 from s4a.method.alignment import N_VOTERS, align_onto, less_confident
@@ -157,6 +157,8 @@ def insert(
         raise ValueError(f"new shapes need other names than the template, {template!r}; rename it")
     descriptors = descriptors_of(study) if compare or reflect == AUTO else {}
     mirrored, remarks = _reflected_of_new(reflect, meshes, list(attrs), descriptors)
+    of_template = study["original"][template].dataset.get("guide_name", xr.DataArray([]))
+    remarks = unpaired(meshes, of_template.values.tolist()) + remarks
     for name in mirrored:
         meshes[name] = mirror_image(meshes[name])
         attrs[name] = attrs[name] | meshes[name].attrs
@@ -265,6 +267,8 @@ def read_new(
     """Read the usable new meshes, with landmarks and fields, and attributes for the report."""
     volumes = options.label is not None and (isinstance(shapes, dict) or not _are_meshes(shapes))
     sources = find_sources(shapes, volumes=volumes)
+    for remark in remarks_on_files(shapes, volumes=volumes):
+        log.warning("%s", remark)
     cleaning = options.of("cleaning")
     if options.label is not None and not volumes:  # meshes for a study of label volumes
         cleaning = cleaning | {"label": None}

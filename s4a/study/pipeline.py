@@ -16,6 +16,7 @@ from joblib import effective_n_jobs, parallel_config
 
 from s4a.input.chirality import AUTO, mean_chirality, mirrored_shapes, to_reflect
 from s4a.input.collection import remarks_on_files
+from s4a.input.landmarks import unpaired
 from s4a.input.plausibility import Flags
 from s4a.input.subjects import read_table
 from s4a.method.alignment import N_VOTERS
@@ -211,6 +212,7 @@ def run_steps(
     #                                                pca, report
     reflected, on_chirality = choose_reflected(run, sources, marked, options)
     original = read_and_clean(run, sources, marked, options, reflected)
+    remarks = unpaired({n: open_file(run.folder / f"original/{n}.nc") for n in original}) + remarks
     original, flags, on_shapes = check_plausibility(run, original, options)
     stop_if_flagged(flags, options)
     coarse = remesh(run, original, options)

@@ -14,6 +14,7 @@ from s4a.show.surfaces import (
     labelled,
     mesh_of,
     names_of,
+    nearest_corner,
     surface,
     template_vertices,
     transferred_colors,
@@ -152,7 +153,7 @@ class Correspondence(Panel):
         if self.registered:
             if self.from_template:
                 return self.registered_match(self.shape)
-            return self.nearest_corner(self.source, self.shape)
+            return nearest_corner(*self.points_on(self.source, self.shape))
         key = self.source, self.shape, self.map.value
         if key not in self.matches:
             full = self.map.value == "dense"
@@ -166,7 +167,7 @@ class Correspondence(Panel):
         if not self.registered:
             return inverse(self.match(), len(Y))
         if not self.from_template:
-            return self.nearest_corner(self.shape, self.source)
+            return nearest_corner(*self.points_on(self.shape, self.source))
         vertices = template_vertices(self.study, self.shape)
         return inverse(self.registered_match(self.shape), len(Y)) if vertices is None else vertices
 
@@ -178,11 +179,6 @@ class Correspondence(Panel):
             corners = T[found["image_triangle"].values]
             self.points[source, target] = corners, found["image_barycentric"].values
         return self.points[source, target]
-
-    def nearest_corner(self, source: str, target: str) -> Array:
-        """Return the target's vertex that is nearest to the image of each vertex of the source."""
-        corners, weights = self.points_on(source, target)
-        return np.take_along_axis(corners, weights.argmax(1)[:, None], axis=1)[:, 0]
 
     def registered_match(self, name: str) -> Array:
         """Return the matched vertex of a shape for each vertex of the template."""

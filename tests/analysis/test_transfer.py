@@ -38,6 +38,7 @@ from s4a.input.annotations import (
     labels_of_mesh,
     read_labels,
     read_landmarks,
+    read_scalars,
     write_landmarks,
 )
 from s4a.input.landmarks import locate
@@ -101,6 +102,9 @@ def test_labels_and_landmarks_of_a_moved_and_renumbered_copy_are_exact(meshes, m
         assert distance(image["image_position"].values, X[true]).max() < 1e-4 * size
         corner = image["image_barycentric"].values.argmax(1)
         assert (T[image["image_triangle"].values, corner] == true).all()
+    lacking = study.filter(lambda node: node.path != "/original/target")
+    with pytest.raises(ValueError, match="meshes of the shapes are needed; /original lacks target"):
+        correspondence(lacking, "source", "target")
     landmarks = mesh[["landmark_name", "landmark_position"]]
     marks = transfer_landmarks(study, landmarks)["source"]
     exact = locate(landmarks, mesh)["landmark_position"].values @ R.T + [30, -20, 5]
@@ -341,6 +345,12 @@ def test_every_label_file_gives_the_same_labels(tmp_path):
         darrays=[nibabel.gifti.GiftiDataArray(label.astype(np.int32), "NIFTI_INTENT_LABEL")]
     )
     nibabel.save(gifti, tmp_path / "a.label.gii")
+    order = np.random.default_rng(0).permutation(len(label)).astype(np.int32)
+    arrays = zip((order, label[order].astype(np.int32)), ("NODE_INDEX", "LABEL"), strict=True)
+    gifti.darrays = [nibabel.gifti.GiftiDataArray(a, f"NIFTI_INTENT_{of}") for a, of in arrays]
+    nibabel.save(gifti, tmp_path / "sparse.label.gii")
+    assert (read_labels(tmp_path / "sparse.label.gii", len(label)) == label).all()
+    assert (read_scalars(tmp_path / "sparse.label.gii", "", len(label)) == label).all()
     colours = np.array([[i, i, i, 0, 0] for i in range(1, 7)])
     nibabel.freesurfer.write_annot(
         tmp_path / "lh.annot", label, colours, list("abcdef"), fill_ctab=True
@@ -392,6 +402,12 @@ def test_a_wrong_label_file_is_named_with_what_was_expected_and_found(tmp_path):
 
 def test_landmarks_are_written_as_a_table_and_other_tables_are_refused(tmp_path):
     points = dataset(landmark_name=["a", "b"], landmark_position=[[1.5, 2, 3], [-4, 5.25, 6]])
+    numbered = points.assign(landmark_name=("landmark", ["#1", "#2"]))
+    write_landmarks(tmp_path / "numbered.csv", numbered)
+    assert read_landmarks(tmp_path / "numbered.csv")["landmark_name"].values.tolist() == [
+        "#1",
+        "#2",
+    ]
     write_landmarks(tmp_path / "out.csv", points)
     rows = ["name,x,y,z", "a,1.5,2.0,3.0", "b,-4.0,5.25,6.0"]
     assert (tmp_path / "out.csv").read_text().split() == rows
@@ -428,7 +444,11 @@ def test_an_invalid_row_is_named_with_its_line(tmp_path, read, text, said):
         read(tmp_path / "rows.csv")
 
 
-def test_empty_cells_behind_a_row_and_comments_change_no_landmark(tmp_path):
+def test_empty_cells_behind_a_row_and_comments_change_no_landmark(tmp_path, caplog):
+    (tmp_path / "points.csv").write_text("name,x,y,z\n# by hand, twice\n#1,1,2,3\nb,4,5,6\n")
+    assert read_landmarks(tmp_path / "points.csv").sizes["landmark"] == 1
+    assert "a row that begins with # is skipped as a comment: #1,1,2,3" in caplog.text
+    assert "by hand" not in caplog.text
     (tmp_path / "points.csv").write_text("name,x,y,z,note\n# by hand\na,1,2,3,,\nb,4,5,6\n")
     found = read_landmarks(tmp_path / "points.csv")["landmark_position"].values
     assert found.tolist() == [[1, 2, 3], [4, 5, 6]]

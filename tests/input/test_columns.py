@@ -55,6 +55,8 @@ def test_other_codes_and_outliers_are_named_with_the_values_of_the_others(caplog
     assert "9 of s3 may" in findings(with_value(9, values=[1, 2] * 6), caplog)
     assert "1750 of s3" in findings(with_value(1750, values=np.arange(12) + 165), caplog)
     assert "-9 of s3 may" in findings(with_value(-9, values=np.linspace(0.3, 17.2, 12)), caplog)
+    assert "-9 of s3 may" in findings(with_value(-9, values=[1, 4, 9, 0, 6, 7] * 2), caplog)
+    assert "-1 of s3 may" in findings(with_value(-1, values=[1, 2] * 6), caplog)
     # the only integer, inside the range of the others
     assert "error: it: 999 of s3" in findings(
         with_value(999, values=np.arange(12) * 200.5 + 0.3), caplog
@@ -104,6 +106,9 @@ def test_the_result_does_not_depend_on_the_order_of_the_values(caplog):
         ("A", "\u0410", False),  # Cyrillic
         ("a-1", "a\u20131", False),  # an en dash
         ("01", "1", False),
+        ("PO1", "P01", False),
+        ("site_l", "site 1", False),
+        ("O\u2019Hara", "O'Hara", False),
     ],
 )
 def test_names_of_groups_that_look_alike_are_named(one, two, refused, caplog):
@@ -111,7 +116,7 @@ def test_names_of_groups_that_look_alike_are_named(one, two, refused, caplog):
     assert found.startswith("error") == refused
     assert f"{one!a} (s0)" in found
     assert f"{two!a} (s2)" in found
-    assert look_alikes([one, "b"]) == []
+    assert look_alikes([one, "b", "Al", "Ai", "10", "11"]) == []
 
 
 def test_codes_among_names_of_groups_are_named(caplog):

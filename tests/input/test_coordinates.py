@@ -139,6 +139,7 @@ def test_a_file_that_states_two_coordinate_systems_is_refused(tmp_path):
         "a.vtp": vtp("ascii").replace(b"<VTKFile", b"<!-- SPACE=RAS --><VTKFile"),
         "a.csv": b"# SPACE=RAS\nname,l,p,s\na,1,2,3\n",
         "b.csv": b"coordinate_system,x,y,z\nRAS,1,2,3\nLPS,1,2,3\n",
+        "c.csv": b"# SPACE=RAS\n# SPACE=LPS\nname,x,y,z\na,1,2,3\n",
     }
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
@@ -146,6 +147,31 @@ def test_a_file_that_states_two_coordinate_systems_is_refused(tmp_path):
             (read_landmarks if "csv" in name else read_mesh)(tmp_path / name)
     (tmp_path / "a.vtk").write_bytes(data.replace(b"%s", b"LPS"))
     assert read_mesh(tmp_path / "a.vtk")[2]["coordinate_system"] == "LPS"
+    both = with_matrix(gifti(tmp_path / "a.gii", (1, 1)), (4, 4), np.eye(4))
+    with pytest.raises(ValueError, match="one DataSpace expected, found MNI_152 and SCANNER_ANAT"):
+        read_mesh(both)
+
+
+def with_matrix(path, spaces, matrix):
+    """A GIFTI file with a second CoordinateSystemTransformMatrix of its points."""
+    more, end = GiftiCoordSystem(*spaces, matrix).to_xml(), b"</CoordinateSystemTransformMatrix>"
+    path.write_bytes(path.read_bytes().replace(end, end + more, 1))
+    return path
+
+
+def test_matrices_of_a_gifti_file_that_differ_leave_the_origin_unknown(tmp_path):
+    moved, transposed = np.eye(4), np.eye(4)
+    moved[:3, 3] = transposed[3, :3] = CRAS
+    path = tmp_path / "a.gii"
+    for more, text in (
+        (((0, 4), np.eye(4)), "surface RAS, c_ras 12 -20 35"),  # to another space
+        (((0, 1), moved), "surface RAS, c_ras 12 -20 35"),
+        (((0, 1), np.eye(4)), "RAS, origin unknown"),
+    ):
+        found = with_matrix(gifti(path, (0, 1), moved), *more)
+        assert read_mesh(found)[2]["coordinate_system"] == text
+    found = read_mesh(gifti(path, (0, 1), transposed))[2]["coordinate_system"]
+    assert found == "RAS, origin unknown"
 
 
 def test_surface_ras_becomes_scanner_ras_for_any_direction_of_the_voxels(tmp_path):
@@ -293,6 +319,19 @@ def test_landmarks_that_fit_a_mesh_in_two_directions_are_reported(caplog):
     caplog.clear()
     locate(dataset(system("LPS").attrs, **points), as_dataset(X, T))
     assert not caplog.text
+
+
+def test_a_landmark_file_that_states_the_wrong_system_is_reported(caplog):
+    both = as_dataset(np.r_[X, 1.08 * X * [-1, -1, 1]], np.r_[T, T + len(X)])  # fits in both
+    both = both.assign_attrs(system("RAS").attrs, path="a.ply")
+    for axes in ("RAS", "LPS"):
+        points = {"landmark_name": list("ab"), "landmark_position": X[[3, 40]]}
+        found = locate(dataset(system(axes).attrs, **points), both)
+        assert (
+            "a.ply: the coordinate system of the landmarks or of the mesh may be wrong"
+            in (caplog.text)
+        ) == (axes == "LPS")
+    assert found["landmark_distance"].values.max() > 0.1  # as stated, nevertheless
 
 
 def test_landmark_files_of_other_programs_are_read(tmp_path, caplog):

@@ -116,6 +116,11 @@ def test_a_volume_that_does_not_say_how_it_lies_is_named(tmp_path):
     _, _, attrs = read_volume(tmp_path / "a.nii", 1)
     assert "left and right may be exchanged" in attrs["note"]
     assert "coordinate_system" not in attrs
+    data = bytearray((tmp_path / "a.nii").read_bytes())
+    data[80:84] = bytes(4)  # the size of the voxels in x
+    (tmp_path / "a.nii").write_bytes(data)
+    with pytest.raises(ValueError, match="sizes of voxels needed, found 0 in pixdim"):
+        read_volume(tmp_path / "a.nii", 1)
 
 
 def test_a_volume_with_two_places_is_named(tmp_path):

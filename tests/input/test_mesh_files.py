@@ -363,9 +363,20 @@ def test_a_second_mesh_in_a_file_is_named(tmp_path):
     write_mesh(tmp_path / "m.vtk", X, T, x=X[:, 0])
     with pytest.raises(ValueError, match=r"one mesh expected, found a second VTK at byte \d+"):
         read_mesh(file(tmp_path, "m.vtk", 2 * (tmp_path / "m.vtk").read_bytes()))
+    write_mesh(tmp_path / "m.vtk", X, T)
+    one = (tmp_path / "m.vtk").read_bytes()
+    with pytest.raises(ValueError, match="a section of polydata expected, found b'POINTS'"):
+        read_mesh(file(tmp_path, "m.vtk", one + one[one.index(b"POINTS") :]))
     for more in ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "3 0 1 2\n"):
         with pytest.raises(ValueError, match=r"found \d more lines than its counts say"):
             read_mesh(file(tmp_path, "m.off", f"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n{more}"))
+    faces = b"element face 1\nproperty list uchar int vertex_indices\n"
+    twice = ply("ascii").replace(b"element face", faces + b"element face")
+    with pytest.raises(ValueError, match="one mesh expected, found two elements 'face'"):
+        read_mesh(file(tmp_path, "m.ply", twice))
+    np.savez(tmp_path / "m.npz", V=X, F=T, vertices=X, faces=T)
+    with pytest.raises(ValueError, match="V, F, vertices, faces: write each mesh to a file of its"):
+        read_mesh(tmp_path / "m.npz")
 
 
 def test_text_in_utf_16_is_named(tmp_path):
@@ -536,4 +547,9 @@ def test_other_files_of_a_folder_are_skipped_and_named(tmp_path):
         ("scores.npz", "an archive of other arrays")
     ]
     assert [path.name for path, _ in not_meshes(tmp_path / "*")] == ["a.json", "scores.npz"]
+    (tmp_path / "volumes").mkdir()
+    (tmp_path / "volumes/a.nii").touch()
+    assert (tmp_path / "volumes", "a folder without meshes") in not_meshes(
+        [tmp_path, tmp_path / "volumes"]
+    )
     assert not_meshes(tmp_path, "a") == []

@@ -174,6 +174,22 @@ def test_a_study_keeps_its_landmarks_and_says_who_has_none(store):
     assert "brain_04" in study["report"].attrs["remarks"]
 
 
+def test_landmarks_that_are_not_paired_are_named(marked, store, tmp_path):
+    meshes, folder = marked
+    own = shutil.copytree(folder, tmp_path / "marks")
+    text = (own / "brain_02.csv").read_text()
+    (own / "brain_02.csv").write_text(text.replace("\na,", "\nA,"))
+    shutil.copytree(store, tmp_path / "study")
+    study = analyse(meshes, landmarks=own, store=tmp_path / "study", **OPTIONS)
+    said = "landmarks without a partner of that name are ignored (brain_02: A)"
+    assert said in study["report"].attrs["remarks"]
+    assert "partner" not in open_study(store)["report"].attrs["remarks"]
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new/brain_05.csv").write_text(text.replace("\na,", "\nA,"))
+    new = insert(study, {"brain_05": meshes["brain_02"]}, landmarks=tmp_path / "new")
+    assert "are ignored (brain_05: A)" in new["report"].attrs["remarks"]
+
+
 def test_a_changed_landmark_file_recomputes_its_shape_only(marked, store, tmp_path):
     meshes, folder = marked
     own = shutil.copytree(folder, tmp_path / "marks")
@@ -230,7 +246,9 @@ def test_landmarks_decide_the_pose_with_every_preset(marked, preset):
         assert np.trace(R.sel(shape="brain_02").values @ turn @ rotation.T) > 2.8
 
 
-def test_the_command_line_takes_them_for_a_study_and_for_new_shapes(marked, tmp_path, capsys):
+def test_the_command_line_takes_them_for_a_study_and_for_new_shapes(
+    marked, tmp_path, capsys, caplog
+):
     meshes, folder = marked
     (tmp_path / "scans").mkdir()
     for name, mesh in meshes.items():
@@ -239,8 +257,11 @@ def test_the_command_line_takes_them_for_a_study_and_for_new_shapes(marked, tmp_
     arguments = ["run", *map(str, files[1:]), "--landmarks", str(folder)]
     assert cli.main([*arguments, "--out", str(tmp_path / "study"), *FLAGS]) == 0
     assert "no landmark file" in capsys.readouterr().out
-    arguments = ["insert", str(tmp_path / "study"), str(files[0]), "--landmarks", str(folder)]
-    assert cli.main([*arguments, "--out", str(tmp_path / "new")]) == 0
+    (tmp_path / "other").mkdir()
+    arguments = ["insert", str(tmp_path / "study"), str(files[0]), str(tmp_path / "other")]
+    arguments += ["--landmarks", str(folder), "--out", str(tmp_path / "new")]
+    assert cli.main(arguments) == 0
+    assert "other is not a mesh (a folder without meshes) and was skipped" in caplog.text
     study = open_study(tmp_path / "study")
     new = insert(study, [files[0]], landmarks=folder)
     assert new["original/brain_01"]["guide_name"].values.tolist() == list("abcd")
