@@ -20,11 +20,10 @@ log = logging.getLogger(__name__)
 
 # cells without a value, in lower case
 MISSING = ("", "-", "na", "n/a", "nan", "#n/a", "<na>", "null")
-# what looks like Latin letters, straight quotes and the hyphen; spaces and _ are dropped
+# what looks like Latin letters, straight quotes and the hyphen
 _SAME = str.maketrans(
     "аеорсухіѕјкмнтвӏԁɑıɡΑΒΕΖΗΙΚΜΝΟΡΤΥΧαοινρυχ’‘ʼ“”‐‑‒–—−",
     "aeopcyxisjkmhtbldaigABEZHIKMNOPTYXaoivpux'''\"\"------",
-    " _",
 )
 _DIGITS = str.maketrans("oli|", "0111")  # O and 0, l and 1
 _PERSON = re.compile(r"(subject|participant|patient|person)([ _-]?(id|nr|no))?", re.IGNORECASE)
@@ -271,7 +270,7 @@ def look_alikes(cells: Sequence[str]) -> list[tuple[bool, list[str]]]:
     Examples
     --------
     >>> from s4a.input.subjects import look_alikes
-    >>> look_alikes(["a", "A", "b", "b\\u200b"])
+    >>> look_alikes(["a", "A", "b", "b\\u200b", "1_1", "11"])
     [(False, ['A', 'a']), (True, ['b', 'b\\u200b'])]
     """
     by_look: dict[str, list[str]] = {}
@@ -299,4 +298,5 @@ def look(text: str) -> str:
     """
     text = unicodedata.normalize("NFKC", visible(text).translate(_SAME))
     text = unicodedata.normalize("NFKC", text.casefold().translate(_SAME))
+    text = re.sub(r"(?<!\d)[ _]|[ _](?!\d)", "", text)  # not between digits: 1_1 is not 11
     return str(float(text)) if is_plain_number(text) else text
