@@ -872,10 +872,10 @@ def remeshed(path):
     s4a.spectrum(s4a.coarsen(pickle.loads(path.read_bytes())[0]))
 
 
-def matched_pair(path):
+def matched_pair(path, n_jobs=1):
     """Match the pair of a file; return the mean error of the surface in % of sqrt(area)."""
     source, target, true = pickle.loads(path.read_bytes())
-    found = s4a.match_pair(source, target)
+    found = s4a.match_pair(source, target, n_jobs=n_jobs)
     moved = target["position"].values + found["displacement"].values - found["translation"].values
     gap = np.linalg.norm(moved @ found["rotation"].values / found["scale"].item() - true, axis=1)
     return 100 * gap.mean() / np.sqrt(triangle_areas(*as_arrays(source)).sum())
@@ -885,15 +885,15 @@ def sizes(folder, *numbers):
     """CPU seconds and memory by the vertices of a mesh, from the file to the match of a pair.
 
     A file is read and cleaned; two are read, cleaned and examined (`s4a check`); a mesh in memory
-    is remeshed, with its spectrum; two in memory are matched.
+    is remeshed, with its spectrum; two in memory are matched, and again in two threads.
     """
     parts = ("read", "check two", "remesh", "match two")
     say(
         "\n| vertices |"
         + "".join(f" {part}, CPU s | MiB |" for part in parts)
-        + " wall s | error, % |"
+        + " wall s | two threads, wall s | error, % |"
     )
-    say("|" + " --- |" * 11)
+    say("|" + " --- |" * 12)
     for n in numbers or (10_000, 30_000, 100_000, 300_000, 1_000_000, 3_500_000):
         files = folder / str(n)
         files.mkdir()
@@ -906,7 +906,8 @@ def sizes(folder, *numbers):
         ]
         spent = "".join(f" {cpu:.1f} | {memory:.0f} |" for _, cpu, _, memory in rows)
         error, _, wall, _ = rows[-1]
-        say(f"| {count:,} |{spent} {wall:.1f} | {error:.3f} |")
+        threads = measured(matched_pair, files / "pair", 2)[2]
+        say(f"| {count:,} |{spent} {wall:.1f} | {threads:.1f} | {error:.3f} |")
         shutil.rmtree(files)
 
 
