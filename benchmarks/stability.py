@@ -66,7 +66,7 @@ def noise(n_runs=6):
         rng = np.random.default_rng(0)
         errors = [
             measure(
-                peers.ours(moved(template, size, rng), moved(shape, size, rng), None, "elastic")
+                peers.ours(noisy(template, size, rng), noisy(shape, size, rng), None, "elastic")
             )[0]
             for size in (0, *[1e-7] * (n_runs - 1))
         ]
@@ -75,7 +75,7 @@ def noise(n_runs=6):
         sys.stdout.flush()
 
 
-def moved(mesh, size, rng):
+def noisy(mesh, size, rng):
     """The mesh with normally distributed noise of this share of sqrt(area)."""
     X, T = as_arrays(mesh)
     scale = size * np.sqrt(vertex_areas(X, T).sum())

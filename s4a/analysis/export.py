@@ -147,7 +147,8 @@ def map_to_scan(
     """
     attrs = _attrs_of(study, name)
     system = file_system(attrs).filled(given or CoordinateSystem())
-    written = system.in_world(*["LPS" if system.axes == "LPS" else "RAS", "mm"] if slicer else [])
+    axes = "LPS" if system.axes == "LPS" else "RAS"
+    written = system.in_world(axes, "mm") if slicer else system.in_world()
     return map_between(system, written, name) @ map_to_file(attrs), written
 
 

@@ -361,9 +361,8 @@ def _search(folder, volumes):
         ]
         like_meshes = [path for path in inner if suffix_of(path) in suffixes and path not in links]
         others += [(path, "a folder, and its files were searched") for path in like_meshes]
-    others += [(folder, f"a folder without {'label volumes' if volumes else 'meshes'}")] * (
-        not files
-    )
+    if not files:
+        others.append((folder, f"a folder without {'label volumes' if volumes else 'meshes'}"))
     others += [
         (Path(error.filename), f"a folder that cannot be searched: {error.strerror}")
         for error in errors

@@ -317,10 +317,11 @@ def with_landmarks(
 def unpaired(meshes: Mapping[str, xr.Dataset], known: Iterable[str] | None = None) -> list[str]:
     """Remarks on guiding landmarks with a name that no other mesh, or none of `known`, has."""
     names = {n: m["guide_name"].values.tolist() for n, m in meshes.items() if "guide_name" in m}
-    count = Counter(itertools.chain(*names.values()) if known is None else 2 * list(known))
-    alone = {n: ", ".join(x for x in found if count[x] < 2) for n, found in names.items()}
+    count = Counter(itertools.chain(*names.values()))
+    paired = {x for x in count if count[x] > 1} if known is None else {*known}
+    alone = {n: ", ".join(x for x in found if x not in paired) for n, found in names.items()}
     texts = "; ".join(f"{n}: {found}" for n, found in alone.items() if found)
-    return [f"landmarks without a partner of that name are ignored ({texts})"] * bool(texts)
+    return [f"landmarks without a partner of that name are ignored ({texts})"] if texts else []
 
 
 def guides_of(mesh: xr.Dataset) -> xr.Dataset:

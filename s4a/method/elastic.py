@@ -347,6 +347,7 @@ def elastic_iterations(
         area = np.bincount(nearest, target.area, len(vertices))
     F = E_B[vertices]
     robust = np.isfinite(schedule.outlier)
+    # with robust weights, the mass matrix is that of an iteration
     weight, mass = area, None if robust else F.T @ (area[:, None] * F)
     n_fixed = len(schedule.stiffness) - schedule.further
     for step, stiffness in enumerate(schedule.stiffness):

@@ -20,7 +20,7 @@ from s4a.method.register import identity, refine_at_full_resolution, register
 from s4a.method.shape import Shape
 from s4a.options import Options, given_options
 from s4a.schema import check_type, dataset
-from s4a.study.processes import workers
+from s4a.study.processes import limited, workers
 from s4a.study.quality_control import check_pair
 from s4a.study.tree import stack_registration, template_mesh
 
@@ -131,7 +131,8 @@ def match_pair(
     settings = given_options({"preset": preset, **options}, pair=True)
     settings = settings.changed({"keep_iterations": keep_iterations})
     meshes = as_meshes({"source": source, "target": target}, settings)
-    with parallel_config("threading", n_jobs=n_jobs) if n_jobs else nullcontext():
+    n_threads = limited(n_jobs)
+    with nullcontext() if n_jobs is None else parallel_config("threading", n_jobs=n_threads):
         M, N = in_threads(lambda mesh: shape_of(mesh, settings), meshes.values())
         with threadpool_limits(1):
             registration, maps = match_shapes(M, N, settings)

@@ -45,7 +45,7 @@ def limited(n_jobs: int | None, n_tasks: int | None = None) -> int | None:
     cores = cpu_count()
     if n_tasks is None and asked > max(cores, 2):
         log.warning(
-            "%d processes were asked for; this machine has %d cores, so %d are used",
+            "%d workers were asked for; this machine has %d cores, so %d are used",
             *(asked, cores, max(cores, 2)),
         )
     most = min(max(cores, 2), max(n_tasks or asked, 1))

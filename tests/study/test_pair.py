@@ -50,9 +50,11 @@ def test_each_kept_iteration_of_zoomout_is_the_map_of_the_match_before_it(meshes
     assert "iteration_fmap" not in s4a.match_pair(source, target, preset="paper", **small)
 
 
-def test_the_result_of_a_pair_does_not_depend_on_the_number_of_threads(meshes):
+def test_the_result_of_a_pair_does_not_depend_on_the_number_of_threads(meshes, caplog):
     source, target, *_ = meshes.values()
-    one, two = (
-        s4a.match_pair(source, target, n_coarse=300, k=20, k_init=10, n_jobs=n) for n in (1, 2)
+    one, two, most = (
+        s4a.match_pair(source, target, n_coarse=300, k=20, k_init=10, n_jobs=n) for n in (1, 2, 999)
     )
     xr.testing.assert_identical(one, two)
+    xr.testing.assert_identical(one, most)
+    assert "999 workers were asked for" in caplog.text

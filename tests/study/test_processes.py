@@ -42,4 +42,4 @@ def test_processes_are_limited_to_cores_and_tasks(monkeypatch, caplog):
     assert [limited(n, 4) for n in (1, 8, 999)] == [1, 4, 4]
     assert caplog.text == ""
     assert limited(999) == 8
-    assert "999 processes were asked for; this machine has 8 cores, so 8 are used" in caplog.text
+    assert "999 workers were asked for; this machine has 8 cores, so 8 are used" in caplog.text
