@@ -21,6 +21,7 @@ _WORDS = re.compile(
     r"[?.]+|none|unknown|missing|not? (available|applicable|data)|n\.a\.|n\.?d\.?|#.*[!?]",
     re.IGNORECASE,
 )
+_DATE = re.compile(r"(19|20)\d\d(0[1-9]|1[0-2])(0[1-9]|[12]\d|3[01])")  # as 20240131
 _NUMBERS = {"true": "1", "yes": "1", "false": "0", "no": "0"}
 _ALONE = 0.995  # share of the variance of a column that an outlier may have
 _LEVEL, _SLIP_LEVEL = 3e-4, 0.04  # of an outlier in a column; of a value ten times the others
@@ -108,6 +109,9 @@ def _check_numbers(x, names, what):
                 "compare it with all others: correct the value, or write NA"
             )
         log.warning("%s: correct the value, or write NA, if it is wrong; the test uses it", text)
+    if rest.sum() > 1 and all(_DATE.fullmatch(cells[i]) for i in np.flatnonzero(rest)):
+        text = "%s: %s look like dates, in whose digits a month is 100 days: write days or years"
+        log.warning(text, what, _range(x[rest]))
     sizes = " and ".join(map(_range, _two_sizes(usual)))
     if sizes:
         log.warning("%s: values of two sizes, %s: are all in one unit?", what, sizes)

@@ -48,6 +48,9 @@ def test_other_codes_and_outliers_are_named_with_the_values_of_the_others(caplog
     assert "values of two sizes, 1.53 to 1.83 and 150 to 180: are all in one unit?" in findings(
         mixed, caplog
     )
+    assert "20240101 to 20241201 look like dates" in findings(
+        20240001 + 100 * np.arange(1, 13), caplog
+    )
     for value in (1e10, -1e5, 1.7e308):
         assert "error: it: outliers" in findings(with_value(value), caplog)
         assert "variance is of one shape" in findings(with_value(value), caplog)
@@ -72,6 +75,7 @@ def test_clean_columns_are_not_reported(caplog):
             *(rng.integers(0, 2, n), rng.random(n) < 0.1, rng.integers(1, 5, n)),
             *(rng.lognormal(8, 0.6, n), rng.normal(size=n), rng.poisson(1.5, n)),
             rng.normal(0, 5, 20 * n).round(),
+            rng.integers(19_000_000, 21_000_000, 20 * n),  # not all of them could be dates
             with_value(31.5, values=adults),
             *(rng.choice([-1, 1], n), np.arange(n), 1000 + rng.permutation(n), np.full(n, 9.0)),
             *([-999.0] * n, with_value(np.nan, values=adults)),
