@@ -15,7 +15,7 @@ step to step, as in the non-rigid ICP of Amberg, Romdhani and Vetter (CVPR 2007)
 bending energy has converged: then the template follows the shape.  If the energy still grows, less
 stiffness would fit noise.  Lengths are for surfaces of unit area.
 
-First, very stiff iterations merge similar initialisations into their mean
+First come very stiff iterations; of the initialisations that end in the same place, one continues
 (:func:`converging_initialisations`).  In these, a_i is multiplied by the Welsch weight
 exp(-|y_i - z_i|^2 / (18 r^2)), r the root mean square distance, as in the robust non-rigid ICP of
 Yao et al. (CVPR 2020): otherwise they do not converge where the nearest point of a vertex
@@ -67,7 +67,7 @@ _MAX_GROWTH = 1.2  # factor of growth of the bending energy below which it has c
 BOUNDARY_WEIGHT = 0.01  # share of sqrt(area): weight of boundary distances, times the length
 _MAX_BOUNDARY_DISTANCE = 0.03  # share of sqrt(area): more distant boundaries do not correspond
 _LANDMARK_WEIGHT = 1e-3  # of each landmark, as a share of the area
-MERGE_DISTANCE = 0.01  # share of sqrt(area): initialisations that end closer are merged
+MERGE_DISTANCE = 0.01  # share of sqrt(area): of initialisations that end closer, one is kept
 _TIME = (2e-2, 2e-4)  # of local iterations: smooths over 0.2, finally over 0.02 of sqrt(area)
 _LOCAL_SLIDE = 0.5
 _N_LOCAL_ITERATIONS = 10
@@ -393,10 +393,10 @@ def elastic_iterations(
 def converging_initialisations(
     source: Basis, target: Basis, warps: dict[str, Warp], landmarks: Landmarks | None = None
 ) -> dict[str, Warp]:
-    """Apply very stiff iterations to each initialisation and merge those that converge.
+    """Apply very stiff iterations to each initialisation, and keep one of those that converge.
 
-    Small changes of the input decide which of two similar ones scores better.  The mean of both
-    varies continuously.
+    Small changes of the input decide which of two similar ones scores better.  That of ICP is kept,
+    as it depends on the two shapes alone and not on the rest of the collection.
 
     Parameters
     ----------
@@ -407,27 +407,20 @@ def converging_initialisations(
     Returns
     -------
     dict
-        Name -> mean warp of those within :data:`MERGE_DISTANCE` of the first, by its name.
+        Name -> warp after the iterations, farther than :data:`MERGE_DISTANCE` from all others.
     """
     options: dict[str, Any] = {"vertices": target.sample_vertices_of(), "landmarks": landmarks}
-    groups: dict[str, list[Warp]] = {}
+    names = sorted(warps, key=lambda name: name != "icp")
     converged = in_threads(
-        lambda initial: elastic_iterations(source, target, initial, CONVERGENCE, **options),
-        warps.values(),
+        lambda name: elastic_iterations(source, target, warps[name], CONVERGENCE, **options), names
     )
-    for name, warp in zip(warps, converged, strict=True):
+    kept: dict[str, Warp] = {}
+    for name, warp in zip(names, converged, strict=True):
         X = move(target, warp)
-        near = (
-            group
-            for group, (representative, *_) in groups.items()
-            if np.linalg.norm(X - move(target, representative), axis=1) @ target.area
-            < MERGE_DISTANCE
-        )
-        groups.setdefault(next(near, name), []).append(warp)
-    return {
-        name: tuple(sum(parameter) / len(parameter) for parameter in zip(*members, strict=True))
-        for name, members in groups.items()
-    }
+        gaps = [np.linalg.norm(X - move(target, other), axis=1) for other in kept.values()]
+        if all(gap @ target.area >= MERGE_DISTANCE for gap in gaps):
+            kept[name] = warp
+    return kept
 
 
 def slides(target: Basis, warps: dict[str, Warp], converged: dict[str, Warp]) -> bool:

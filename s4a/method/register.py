@@ -538,10 +538,10 @@ def elastic_surfaces(
 ) -> dict[str, Array]:
     """Return the template ``(n_target, 3)`` after elastic and local iterations, by initialisation.
 
-    Initialisations that converge are merged, see
-    :func:`s4a.method.elastic.converging_initialisations`.  If their mean ends on a wrong fold, less
-    stiff iterations from the separate initialisations, `less_stiff`, may find the right one.  They
-    are not merged either if that :func:`s4a.method.elastic.slides` along the surface.
+    Of initialisations that converge one is kept, see
+    :func:`s4a.method.elastic.converging_initialisations`.  If it ends on a wrong fold, less stiff
+    iterations from all initialisations, `less_stiff`, may find the right one.  All are kept, too,
+    if the surface slides in the very stiff iterations, see :func:`s4a.method.elastic.slides`.
     """
     M, N, landmarks = source.full, target.low_on_surface, _common_landmarks(source, target)
     schedule = DEFORMATION
