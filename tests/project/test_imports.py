@@ -16,7 +16,6 @@ from s4a.geometry.compiled import PACKAGES
 
 structure = script(ROOT / "tools" / "structure.py")
 MODULES = structure.modules_of()
-GRAPH = {name: structure.imports_of(path) & {*MODULES} - {name} for name, path in MODULES.items()}
 # what the extension may use: docs/extensions.md names the modules, all without an underscore
 PUBLIC = re.compile(
     r"(schema|seeds|extensions|cli(\.(commands|flags|tables))?|(geometry|input|method|analysis|evaluation|show|widgets"
@@ -32,11 +31,12 @@ def test_a_module_imports_only_from_subpackages_before_its_own_and_in_no_circle(
     order = {name: i for i, name in enumerate(structure.SUBPACKAGES)}
     order |= {name: len(order) for name in structure.FRONT}
     levels = {name: order[name.partition(".")[0]] for name in MODULES}
-    against = [(a, b) for a, needs in GRAPH.items() for b in needs if levels[b] > levels[a]]
+    used = {n: structure.imports_of(path) & {*MODULES} - {n} for n, path in MODULES.items()}
+    against = [(a, b) for a, needs in used.items() for b in needs if levels[b] > levels[a]]
     assert against == []
     # the front imports from all; `import s4a` itself is no import of the package's public names
-    assert [name for name, needs in GRAPH.items() if "__init__" in needs] == []
-    graph = {name: needs - {name.partition(".")[0]} for name, needs in GRAPH.items()}
+    assert [name for name, needs in used.items() if "__init__" in needs] == []
+    graph = {name: needs - {name.partition(".")[0]} for name, needs in used.items()}
     assert len([*TopologicalSorter(graph).static_order()]) == len(MODULES)  # CycleError if so
     relative = [
         name for name, path in MODULES.items() if re.search(r"^\s*from \.", text(path), re.M)

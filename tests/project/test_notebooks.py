@@ -103,7 +103,8 @@ async def added(client, source):
 # what lessons import is loaded once; the kernel of each is a fork of that process
 LOADED = ["ipykernel.kernelapp", "matplotlib.pyplot", "ipywidgets", "sklearn.decomposition"]
 LOADED += ["s4a.course", "s4a.widgets", "s4a.study.pipeline", "s4a.analysis.statistics"]
-LOADED += ["s4a_morphometrics.part", "small"]
+LOADED += ["s4a_morphometrics.part", "s4a_morphometrics.structures_panel", "small", "dask.array"]
+LOADED += ["ipykernel.debugger", "matplotlib_inline.backend_inline", "IPython.core.pylabtools"]
 
 
 class Fork:
@@ -145,9 +146,8 @@ async def played(path, folder):
         for i, cell in enumerate(list(notebook.cells)):
             for many, few in FEWER.items() if cell.cell_type == "code" else ():
                 cell.source = cell.source.replace(many, few)
-            await client.async_execute_cell(
-                cell, i
-            )  # CellExecutionError where it fails and may not
+            # CellExecutionError where it fails and may not
+            await client.async_execute_cell(cell, i)
             outputs = cell.get("outputs", [])
             told = [
                 o
@@ -170,13 +170,8 @@ def untracked(folder):
     ]
     if not names or not (ROOT / ".git").exists():
         return []
-    ignored = subprocess.run(
-        ["git", "check-ignore", "--no-index", *names],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = ["git", "check-ignore", "--no-index", *names]
+    ignored = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     return sorted({*names} - {*ignored.stdout.splitlines()})
 
 
@@ -189,9 +184,8 @@ def test_it_runs_and_its_exercises_pass_solved_and_are_no_error_open(
         try:
             spent = asyncio.run(played(path, tmp_path))
             break
-        except (
-            nbclient.exceptions.CellTimeoutError
-        ):  # once in many runs a kernel is idle while the client waits for it
+        except nbclient.exceptions.CellTimeoutError:
+            # once in many runs a kernel is idle while the client waits for it
             if not tries_left:
                 raise
     record_property("notebook", (path.stem, spent["seconds"], spent["MiB"]))

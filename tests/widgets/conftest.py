@@ -54,20 +54,11 @@ def lab(folder):
         "LabApp.app_settings_dir": folder / "app",
         "LabApp.expose_app_in_browser": True,  # for its themes
     }
-    command = [
-        sys.executable,
-        "-m",
-        "jupyterlab",
-        "--allow-root",
-        *(f"--{k}={v}" for k, v in options.items()),
-    ]
+    command = [sys.executable, "-m", "jupyterlab", "--allow-root"]
+    command += [f"--{k}={v}" for k, v in options.items()]
+    env = os.environ | own | {"IPYTHONDIR": str(folder / "ipython")}
     with open(folder / "lab.log", "w") as log:
-        process = subprocess.Popen(
-            command,
-            env=os.environ | own | {"IPYTHONDIR": str(folder / "ipython")},
-            stdout=log,
-            stderr=log,
-        )
+        process = subprocess.Popen(command, env=env, stdout=log, stderr=log)
         try:
             wait_for(f"http://127.0.0.1:{port}/api", folder / "lab.log")
             yield f"http://127.0.0.1:{port}"
