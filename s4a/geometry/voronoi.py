@@ -16,7 +16,14 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from s4a.geometry.align import oscillation
-from s4a.geometry.mesh import components, directed_edges, edge_graph, triangle_areas, unique_edges
+from s4a.geometry.mesh import (
+    components,
+    counted_edges,
+    directed_edges,
+    edge_graph,
+    triangle_areas,
+    unique_edges,
+)
 from s4a.schema import Array
 
 
@@ -53,7 +60,7 @@ def mesh_graph(X: Array, T: Array, found: tuple[Array, Array] | None = None) -> 
     `found` are the edges and the triangles per edge, if they are known.
     Lengths change by at most a hundredth, so that few vertices are equally far from two samples.
     """
-    E, count = found or unique_edges(T, len(X))[::2]
+    E, count = found or counted_edges(T, len(X))
     G, factor = edge_graph(X, E), 1 + 0.005 * oscillation(X)
     G.data *= np.repeat(factor, np.diff(G.indptr))
     G.data *= factor.take(G.indices)

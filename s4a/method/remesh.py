@@ -293,7 +293,7 @@ def check_clean(X: Array, T: Array) -> tuple[dict[str, int], tuple[Array, Array]
         Unless positions are finite, indices valid, vertices in use and edges manifold.
     """
     _check_numbers(X, T)
-    found = surface.unique_edges(T, len(X))[::2]
+    found = surface.counted_edges(T, len(X))
     counts = topology(T, *found)
     unused, nonmanifold = len(X) - surface.n_used(T), counts["nonmanifold_edges"]
     if unused or nonmanifold:
@@ -422,7 +422,7 @@ def coarsen(
     V, F = X, T
     if wrap:
         V, F, _ = _sorted_mesh(*alpha_wrap(X, T))
-        found = surface.unique_edges(F, len(V))[::2]
+        found = surface.counted_edges(F, len(V))
     if len(V) <= n_coarse:
         Y, C = V, F
         sample = cell = np.arange(len(V))
@@ -448,7 +448,7 @@ def coarsen(
         shares = weight * vertex_areas(X, T)[:, None]
         area = np.bincount(corner.ravel(), shares.ravel(), len(Y))
     E, w, area, attrs["laplacian"] = laplacian(Y, C, area)
-    attrs |= topology(C, *surface.unique_edges(C)[::2])
+    attrs |= topology(C, *surface.counted_edges(C))
     attrs |= {f"{name}_original": count for name, count in before.items()}
     rank = np.argsort(order)  # back to the numbering of the input
     return dataset(
