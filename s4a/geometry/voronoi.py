@@ -101,11 +101,14 @@ def add_samples(G: sp.csr_matrix, new: Array, state: Voronoi) -> Voronoi:
 def voronoi_cells(G: sp.csr_matrix, sample: Array) -> Voronoi:
     """Return Voronoi cells of samples, with a sample added in each component without one."""
     n = G.shape[0]
+    empty = Voronoi(np.empty(0, np.int64), np.full(n, -1), np.full(n, np.inf))
+    state = add_samples(G, np.unique(sample), empty)
+    if np.isfinite(state.distance).all():
+        return state
     _, component = connected_components(G, directed=False)
     _, first = np.unique(component, return_index=True)
-    sample = np.union1d(sample, first[~np.isin(component[first], component[sample])])
-    empty = Voronoi(np.empty(0, np.int64), np.full(n, -1), np.full(n, np.inf))
-    return add_samples(G, sample, empty)
+    missing = first[~np.isin(component[first], component[sample])]
+    return add_samples(G, np.union1d(sample, missing), empty)
 
 
 def dual(T: Array, cell: Array) -> Array:
