@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from s4a.geometry.compiled import igl
 from s4a.geometry.mesh import (
-    counting_order,
+    counting_sort,
     order_in_space,
     triangle_areas,
     triangle_normals,
@@ -339,10 +339,9 @@ def stars(T: Array, n: int) -> Stars:
     >>> around.degree.tolist(), around.triangle[around.start[3] :].tolist()
     ([1, 2, 2, 1], [1])
     """
-    corner = counting_order(T.ravel(), n)
+    corner, first = counting_sort(T.ravel(), n)
     b, c = (np.roll(T, shift, axis=1).ravel().take(corner) for shift in (-1, -2))
-    degree = np.bincount(T.ravel(), minlength=n)
-    return Stars(corner, (b, c), np.cumsum(degree) - degree, degree)
+    return Stars(corner, (b, c), first[:-1], np.diff(first))
 
 
 def closest_point_in_star(

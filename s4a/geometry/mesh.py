@@ -111,10 +111,12 @@ def vertex_normals(X: Array, T: Array) -> Array:
 
 
 def normals_and_areas(X: Array, T: Array) -> tuple[Array, Array]:
-    """Return :func:`vertex_normals` and :func:`vertex_areas`, which share their computations."""
-    normals = triangle_normals(X, T)
-    areas = 0.5 * norms(normals)
-    return _unit(sums_at_vertices(T, normals, len(X))), sums_at_vertices(T, areas / 3, len(X))
+    """Return :func:`vertex_normals` and :func:`vertex_areas`, from one pass over triangles."""
+    values = np.empty((len(T), 4))
+    for block, (x, y, z) in _normals_in_blocks(X, T):
+        values[block] = np.stack([x, y, z, 0.5 * np.sqrt(x * x + y * y + z * z) / 3], axis=1)
+    sums = sums_at_vertices(T, values, len(X))
+    return _unit(sums[:, :3].copy()), sums[:, 3].copy()
 
 
 def _unit(N):
@@ -239,10 +241,15 @@ def counting_order(key: Array, n: int) -> Array:
     >>> counting_order(np.array([2, 0, 1, 0]), 3).tolist()
     [1, 3, 2, 0]
     """
+    return counting_sort(key, n)[0].astype(np.int64)
+
+
+def counting_sort(key: Array, n: int) -> tuple[Array, Array]:
+    """Return :func:`counting_order` and the first element of each integer in it ``(n + 1,)``."""
     _check_numbers(key, n)  # others would be written outside of the arrays
     m = len(key)
-    indicator = sp.csr_matrix((np.empty(m, np.int8), key, np.arange(m + 1)), (m, n))
-    return indicator.tocsc().indices.astype(np.int64)
+    indicator = sp.csr_matrix((np.empty(m, np.int8), key, np.arange(m + 1)), (m, n)).tocsc()
+    return indicator.indices, indicator.indptr
 
 
 def order_in_space(X: Array) -> Array:
@@ -380,7 +387,7 @@ def path_lengths(
 
 
 def _find_short_paths(tree, G, start, end, longest, length):
-    """Enter paths of at most 1.5 times the distance of their ends, then 3, 6, ..., and `longest`.
+    """Enter paths of at most 1.5 times the distance of their ends, then 2.25, ..., and `longest`.
 
     A path of at most a length lies in the ball of this diameter around the middle of its ends.
     """
@@ -391,7 +398,7 @@ def _find_short_paths(tree, G, start, end, longest, length):
         for i, ball in zip(pair, map(np.array, balls), strict=True):
             first, last = np.searchsorted(ball, (start[i], end[i]))
             length[i] = dijkstra(G[ball][:, ball], indices=first, limit=reach[i])[last]
-        reach *= 2
+        reach *= 1.5
 
 
 def half_cotangents(X: Array, T: Array) -> Array:

@@ -11,7 +11,7 @@ import xarray as xr
 
 from s4a.geometry.align import RigidTransform
 from s4a.geometry.closest import closest_point_in_star, interpolate, match_surfaces
-from s4a.geometry.mesh import as_arrays, log_shares, triangle_areas, vertex_areas
+from s4a.geometry.mesh import as_arrays, log_shares, norms, triangle_areas, vertex_areas
 from s4a.method import spectral_icp
 from s4a.method.deform import displacement_in_template, distortion
 from s4a.method.elastic import (
@@ -620,10 +620,9 @@ def closest_on_template(source: Basis, moved: Basis) -> tuple[Array, Array]:
 
 def round_trip(target: Shape, match: Array, triangle: Array, barycentric: Array) -> Array:
     """Distance after template -> shape -> template ``(n_target,)``, as a share of sqrt(area)."""
-    X = target.full.X
-    corner = X[target.full.T[triangle[match]]]  # (n_target, 3 corners, 3)
-    back = np.einsum("nc,ncx->nx", barycentric[match], corner)
-    return np.linalg.norm(back - X, axis=1)
+    X, T = target.full.X, target.full.T
+    back = interpolate(X, T, triangle[match], barycentric[match])
+    return norms(back - X)
 
 
 def log_area_ratio(image: Array, X: Array, T: Array) -> Array:
