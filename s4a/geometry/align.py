@@ -112,7 +112,9 @@ def oscillation(P: Array) -> Array:
 
 def without_ties(P: Array, size: float = 1e-3) -> Array:
     """Move points ``(n, d)`` from their mean by at most `size` times the radius; few tie then."""
-    return P + size * oscillation(P)[:, None] * (P - P.mean(0))
+    offset = P - P.mean(0)
+    offset *= size * oscillation(P)[:, None]
+    return np.add(P, offset, out=offset)
 
 
 def farthest_points(P: Array, k: int) -> Array:
@@ -200,8 +202,7 @@ def many_farthest_points(P: Array, k: int, *, center: Array, seed: int = 0) -> A
         return np.arange(len(P))
     if k < 1:
         return np.arange(0)
-    P = without_ties(P)
-    P -= center
+    P = without_ties(P) - center
     radius = norms(P)
     if not fpsample:
         if seed:
@@ -215,8 +216,7 @@ def many_farthest_points(P: Array, k: int, *, center: Array, seed: int = 0) -> A
     extra[0, -1] = -8 * radius.max() - 1
     if seed:
         extra[0, :-1] = -P[np.argsort(-radius, kind="stable")[seed % len(P)]]
-    points = np.zeros((len(P) + 1, len(extra.T)), np.float32)  # (n + 1, d + 1)
-    points[0], points[1:, :-1] = extra, P
+    points = np.concatenate([extra, np.c_[P, np.zeros(len(P))]])  # (n + 1, d + 1)
     depth = int(np.log2(len(points)))
     height = min(depth, max(7, depth - 9))  # of the tree; each leaf needs a point
     sample = fpsample.bucket_fps_kdline_sampling(points, k + 1, h=height, start_idx=0)

@@ -3,7 +3,6 @@
 A point on a surface is given by a triangle and three barycentric weights of its corners.
 """
 
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -11,14 +10,9 @@ import scipy.sparse as sp
 from joblib import effective_n_jobs
 from scipy.spatial import cKDTree
 
+from s4a.geometry import mesh as surface
 from s4a.geometry.compiled import igl
-from s4a.geometry.mesh import (
-    counting_sort,
-    order_in_space,
-    triangle_areas,
-    triangle_normals,
-    vertex_normals,
-)
+from s4a.geometry.mesh import order_in_space, triangle_areas, triangle_normals, vertex_normals
 from s4a.schema import Array
 
 # weights of positions (unit area) and unit normals in the search for nearest points
@@ -27,6 +21,7 @@ POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
 # noise of a scan's normals, 0.1 and more, weighs less than several edges at 100,000 vertices
 _CLOSE_WEIGHT = 0.05
 _AT_ONCE = 4096  # points whose triangles are searched at once, in the cache
+Orders = tuple[Array | None, Array | None]
 _FLAT = 1e-14  # squared sine of the angle at A below which a triangle is degenerate
 
 
@@ -157,16 +152,10 @@ class FeatureTree:
     """
 
     def __init__(self, rows: Array, order: Array | None = None) -> None:
+        self.data = rows
         self._order = order_in_space(rows) if order is None else order
         # the leaf size suits queries far from the rows, which take most of the time
         self._tree = cKDTree(rows.take(self._order, axis=0), leafsize=64, balanced_tree=False)
-
-    @cached_property
-    def data(self) -> Array:
-        """The rows ``(n, d)``."""
-        rows = np.empty(self._tree.data.shape)
-        rows[self._order] = self._tree.data
-        return rows
 
     def query(self, rows: Array, order: Array | None = None) -> tuple[Array, Array]:
         """Return the distance and the index of the nearest row, for each of some rows (q, d).
@@ -187,11 +176,7 @@ def feature_tree(X: Array, T: Array) -> FeatureTree:
 
 
 def match_surfaces(
-    Y: Array,
-    normals_y: Array,
-    X: Array,
-    normals_x: Array,
-    orders: tuple[Array | None, Array | None] = (None, None),
+    Y: Array, normals_y: Array, X: Array, normals_x: Array, orders: Orders = (None, None)
 ) -> Array:
     """Match each vertex of a surface to the nearest vertex of a coinciding surface: ``(n,)``.
 
@@ -339,7 +324,7 @@ def stars(T: Array, n: int) -> Stars:
     >>> around.degree.tolist(), around.triangle[around.start[3] :].tolist()
     ([1, 2, 2, 1], [1])
     """
-    corner, first = counting_sort(T.ravel(), n)
+    corner, first = surface.counting_sort(T.ravel(), n)
     b, c = (np.roll(T, shift, axis=1).ravel().take(corner) for shift in (-1, -2))
     return Stars(corner, (b, c), first[:-1], np.diff(first))
 

@@ -57,10 +57,7 @@ def _normals_in_blocks(X, T):
 
 def triangle_areas(X: Array, T: Array) -> Array:
     """Return the areas of the triangles ``(m,)``."""
-    areas = np.empty(len(T))
-    for block, (x, y, z) in _normals_in_blocks(X, T):
-        areas[block] = 0.5 * np.sqrt(x * x + y * y + z * z)
-    return areas
+    return 0.5 * norms(triangle_normals(X, T))
 
 
 def vertex_areas(X: Array, T: Array) -> Array:
@@ -80,10 +77,8 @@ def sums_at_vertices(T: Array, values: Array, n: int) -> Array:
     >>> sums_at_vertices(np.array([[0, 1, 2], [2, 1, 3]]), np.array([1.0, 2.0]), 4).tolist()
     [1.0, 3.0, 3.0, 2.0]
     """
-    corners = T.ravel()
-    _check_numbers(corners, n)  # others would be written outside of the sums
-    m, ones = len(T), np.ones(len(corners), np.asarray(values).dtype)
-    corner = sp.csr_matrix((ones, corners, np.arange(0, 3 * m + 1, 3)), (m, n))
+    _check_numbers(T, n)  # others would be written outside of the sums
+    corner = sp.csr_matrix((np.ones(T.size), T.ravel(), np.arange(0, T.size + 1, 3)), (len(T), n))
     return corner.T @ values  # adds in the order of the triangles
 
 
@@ -107,7 +102,7 @@ def normal_sums(X: Array, T: Array) -> Array:
 
 def vertex_normals(X: Array, T: Array) -> Array:
     """Return area-weighted unit normals of the vertices ``(n, 3)``; zero without area."""
-    return _unit(normal_sums(X, T))
+    return normals_and_areas(X, T)[0]
 
 
 def normals_and_areas(X: Array, T: Array) -> tuple[Array, Array]:
@@ -116,14 +111,8 @@ def normals_and_areas(X: Array, T: Array) -> tuple[Array, Array]:
     for block, (x, y, z) in _normals_in_blocks(X, T):
         values[block] = np.stack([x, y, z, 0.5 * np.sqrt(x * x + y * y + z * z) / 3], axis=1)
     sums = sums_at_vertices(T, values, len(X))
-    return _unit(sums[:, :3].copy()), sums[:, 3].copy()
-
-
-def _unit(N):
-    """Vectors ``(n, 3)`` divided in place by their length, unless it is 0."""
-    length = norms(N)
-    N /= np.where(length > 0, length, 1)[:, None]
-    return N
+    length = norms(sums[:, :3])
+    return sums[:, :3] / np.where(length > 0, length, 1)[:, None], sums[:, 3].copy()
 
 
 def norms(vectors: Array) -> Array:
@@ -182,21 +171,15 @@ def counted_edges(T: Array, n: int | None = None) -> tuple[Array, Array]:
 
     In a third of the time of :func:`unique_edges`, where the arguments are explained.
     """
-    low, high, n = _ends(T, n)
-    ones = np.ones(len(low), np.int32)
-    count = sp.coo_matrix((ones, (low, high)), (n, n)).tocsr()  # sums at equal ends
-    first = np.repeat(np.arange(n), np.diff(count.indptr))
-    return np.stack([first, count.indices], axis=1, dtype=np.int64), count.data
-
-
-def _ends(T, n):
-    """Lower and higher end of each half-edge, in the order of directed_edges, and n."""
-    start = np.asarray(T).T.ravel()
+    start = np.asarray(T).T.ravel()  # as in directed_edges
     n = int(start.max(initial=0)) + 1 if n is None else n
     _check_numbers(start, n)
     start = start.astype(np.int32 if n < 2**31 else np.int64, copy=False)  # the smaller, the faster
     end = np.roll(start, -len(T))
-    return np.minimum(start, end), np.maximum(start, end), n
+    ends = np.minimum(start, end), np.maximum(start, end)
+    count = sp.coo_matrix((np.ones(len(start), np.int32), ends), (n, n)).tocsr()  # adds equal edges
+    first = np.repeat(np.arange(n), np.diff(count.indptr))
+    return np.stack([first, count.indices], axis=1, dtype=np.int64), count.data
 
 
 def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
@@ -218,9 +201,10 @@ def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
         Triangles at the edge: 2 in the interior of a manifold, 1 on its boundary.
     """
     E, count = counted_edges(T, n)
-    low, high, n = _ends(T, n)
-    number = sp.csr_matrix((np.arange(len(E)), E.T), (n, n))
-    return E, np.asarray(number[low, high]).ravel() if len(E) else np.zeros(0, int), count
+    if len(E) == 0:
+        return E, np.zeros(0, np.int64), count
+    number, ends = sp.csr_matrix((np.arange(len(E)), E.T)), directed_edges(T).T
+    return E, np.asarray(number[ends.min(0), ends.max(0)]).ravel(), count
 
 
 def _check_numbers(key, n):
@@ -343,7 +327,7 @@ def edge_graph(X: Array, E: Array) -> sp.csr_matrix:
 
 
 def path_lengths(
-    G: sp.csr_matrix, start: Array, end: Array, limit: float, tree: cKDTree | None = None
+    G: sp.csr_matrix, start: Array, end: Array, limit: float, X: Array | None = None
 ) -> Array:
     """Return lengths of shortest edge paths between pairs of vertices ``(p,)``, at most `limit`.
 
@@ -357,8 +341,8 @@ def path_lengths(
     start, end : int ndarray (p,)
     limit : float
         In the unit of the edges.
-    tree : cKDTree, optional
-        Of the positions.  Of a large surface, short paths are then searched around their ends only.
+    X : float ndarray (n, 3), optional
+        Positions.  Of a large surface, short paths are then searched around their ends only.
 
     Examples
     --------
@@ -373,10 +357,10 @@ def path_lengths(
         return np.zeros(0)
     edge = np.asarray(G[start, end]).ravel()
     length = np.where(start == end, 0.0, np.where(edge > 0, edge, np.inf))
-    if tree is not None:
-        _find_short_paths(tree, G, start, end, 0.5 * limit, length)
+    if X is not None:
+        _find_short_paths(X, G, start, end, 0.5 * limit, length)
     step = max(1, min(64, 2**22 // G.shape[0]))  # origins at a time: at most 32 MB of distances
-    for reach in (0.1 * limit, limit) if tree is None else (limit,):
+    for reach in (0.1 * limit, limit) if X is None else (limit,):
         missing = np.flatnonzero(np.isinf(length))
         origin, row = np.unique(start[missing], return_inverse=True)
         for first in range(0, len(origin), step):
@@ -386,12 +370,12 @@ def path_lengths(
     return np.minimum(length, limit)
 
 
-def _find_short_paths(tree, G, start, end, longest, length):
+def _find_short_paths(X, G, start, end, longest, length):
     """Enter paths of at most 1.5 times the distance of their ends, then 2.25, ..., and `longest`.
 
     A path of at most a length lies in the ball of this diameter around the middle of its ends.
     """
-    P, Q = tree.data[start], tree.data[end]
+    tree, P, Q = cKDTree(X, balanced_tree=False, compact_nodes=False), X[start], X[end]
     reach = np.maximum(1.5 * norms(P - Q), 0.01 * longest)
     while len(pair := np.flatnonzero(np.isinf(length) & (reach < longest))):
         balls = tree.query_ball_point((P + Q)[pair] / 2, reach[pair] * 0.5001, return_sorted=True)

@@ -15,15 +15,9 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from s4a.geometry import mesh as surface
 from s4a.geometry.align import oscillation
-from s4a.geometry.mesh import (
-    components,
-    counted_edges,
-    directed_edges,
-    edge_graph,
-    triangle_areas,
-    unique_edges,
-)
+from s4a.geometry.mesh import components, directed_edges, edge_graph, triangle_areas
 from s4a.schema import Array
 
 
@@ -60,7 +54,7 @@ def mesh_graph(X: Array, T: Array, found: tuple[Array, Array] | None = None) -> 
     `found` are the edges and the triangles per edge, if they are known.
     Lengths change by at most a hundredth, so that few vertices are equally far from two samples.
     """
-    E, count = found or counted_edges(T, len(X))
+    E, count = found or surface.counted_edges(T, len(X))
     G, factor = edge_graph(X, E), 1 + 0.005 * oscillation(X)
     G.data *= np.repeat(factor, np.diff(G.indptr))
     G.data *= factor.take(G.indices)
@@ -103,12 +97,12 @@ def voronoi_cells(G: sp.csr_matrix, sample: Array) -> Voronoi:
     n = G.shape[0]
     empty = Voronoi(np.empty(0, np.int64), np.full(n, -1), np.full(n, np.inf))
     state = add_samples(G, np.unique(sample), empty)
-    if np.isfinite(state.distance).all():
-        return state
-    _, component = connected_components(G, directed=False)
-    _, first = np.unique(component, return_index=True)
-    missing = first[~np.isin(component[first], component[sample])]
-    return add_samples(G, np.union1d(sample, missing), empty)
+    if np.isinf(state.distance).any():
+        _, component = connected_components(G, directed=False)
+        _, first = np.unique(component, return_index=True)
+        sample = np.union1d(sample, first[~np.isin(component[first], component[sample])])
+        state = add_samples(G, sample, empty)
+    return state
 
 
 def dual(T: Array, cell: Array) -> Array:
@@ -346,7 +340,7 @@ def cut_handles(X: Array, T: Array, removed: Array, crumb: float) -> tuple[Array
         Index of each vertex in the given mesh, -1 for the centres.
     """
     n, area = len(X), triangle_areas(X, T)
-    E, edge_of, count = unique_edges(T, n)
+    E, edge_of, count = surface.unique_edges(T, n)
     component = components(E, n)
 
     def left_at_edge():

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from s4a.geometry.mesh import counting_order
+from s4a.geometry.mesh import counting_sort
 from s4a.schema import Array
 
 BLOCK = 512  # cells of queries whose distances to all other cells are in memory at once
@@ -206,12 +206,11 @@ def into_cells(rows: Rows, cell: Array, middle: Array | float = 0.0) -> Cells:
     """Group rows `(n, d)`, less `middle`, by their cell numbers `(n,)`, without empty cells."""
     _, cell = np.unique(cell, return_inverse=True)
     count = np.bincount(cell)
-    order = counting_order(cell, len(count))
+    order, start = counting_sort(cell, len(count))
     in_order = np.empty(rows.shape, np.float32)
     for i in range(0, len(order), _BLOCK_OF_ROWS):  # no second copy of all rows
         some = slice(i, i + _BLOCK_OF_ROWS)
         np.subtract(rows[order[some]], middle, out=in_order[some], casting="same_kind")
-    start = np.concatenate([[0], np.cumsum(count)])
     ones = np.ones(len(order), np.float32)
     sums = sp.csr_matrix((ones, np.arange(len(order)), start), (len(count), len(order))) @ in_order
     center = sums / count[:, None].astype(np.float32)
@@ -220,7 +219,7 @@ def into_cells(rows: Rows, cell: Array, middle: Array | float = 0.0) -> Cells:
         some = slice(i, i + _BLOCK_OF_ROWS)
         distance[some] = np.linalg.norm(in_order[some] - center.take(cell[some], axis=0), axis=1)
     radius = np.maximum.reduceat(distance, start[:-1]) * _SLACK
-    return Cells(in_order, order, start, center, radius)
+    return Cells(in_order, order.astype(np.int64), start, center, radius)
 
 
 def _squared_distances(A, B):

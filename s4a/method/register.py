@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from s4a.geometry import mesh as surface
 from s4a.geometry.align import RigidTransform
 from s4a.geometry.closest import closest_point_in_star, interpolate, match_surfaces
-from s4a.geometry.mesh import as_arrays, log_shares, norms, triangle_areas, vertex_areas
+from s4a.geometry.mesh import as_arrays, norms, triangle_areas, vertex_areas
 from s4a.method import spectral_icp
 from s4a.method.deform import displacement_in_template, distortion
 from s4a.method.elastic import (
@@ -63,11 +64,8 @@ def stretch(X: Array, image: Array, T: Array) -> Array:
     before = triangle_areas(X, T)
     squared = (area**2 + conformal**2) / 2  # log(s1)^2 + log(s2)^2
     squared = np.minimum(np.where(np.isnan(squared), 0.0, squared), 100.0)  # degenerate, collapsed
-    corners = T.ravel()
-    total, weight = (
-        np.bincount(corners, np.repeat(values, 3), len(X)) for values in (before * squared, before)
-    )
-    return np.sqrt(total / np.maximum(weight, np.finfo(float).tiny))
+    sums = surface.sums_at_vertices(T, np.stack([before * squared, before], axis=1), len(X))
+    return np.sqrt(sums[:, 0] / np.maximum(sums[:, 1], np.finfo(float).tiny))
 
 
 def confidence_features(source: Shape, target: Shape, match: Array, P: Array) -> Array:
@@ -485,8 +483,7 @@ def register_surface(
     results = _lowest_score(results)
     ((best, (score, moved)),) = results.items()
     if best != "intrinsic":
-        orders = moved.order, M.order
-        match = match_surfaces(moved.X, moved.normals, M.X, M.normals, orders)
+        match = match_surfaces(moved.X, moved.normals, M.X, M.normals, (moved.order, M.order))
     attrs |= {"initialisation": best, "score": score}
     return match, moved, attrs
 
@@ -638,7 +635,7 @@ def log_area_ratio(image: Array, X: Array, T: Array) -> Array:
     >>> (log_area_ratio(2 * X, X, T) + 0.0).tolist()
     [0.0, 0.0, 0.0]
     """
-    image, X = (log_shares(vertex_areas(positions, T)) for positions in (image, X))
+    image, X = (surface.log_shares(vertex_areas(positions, T)) for positions in (image, X))
     return image - X
 
 

@@ -29,14 +29,7 @@ from s4a.geometry import voronoi
 from s4a.geometry.align import many_farthest_points, without_ties
 from s4a.geometry.closest import closest_point, closest_point_in_star
 from s4a.geometry.compiled import robust_laplacian
-from s4a.geometry.mesh import (
-    as_arrays,
-    normals_and_areas,
-    norms,
-    triangle_areas,
-    vertex_areas,
-    vertex_normals,
-)
+from s4a.geometry.mesh import as_arrays, norms, triangle_areas, vertex_areas, vertex_normals
 from s4a.input.collection import Mesh, as_mesh
 from s4a.options import check
 from s4a.schema import Array, check_count, dataset
@@ -72,7 +65,7 @@ def sample_surface(
     -------
     int ndarray, sorted
     """
-    N, area = normals_and_areas(X, T)
+    N, area = surface.normals_and_areas(X, T)
     spacing = np.sqrt(2 / np.sqrt(3) * area.sum() / k)  # edge of equilateral triangles
     ring = G.astype(bool).astype(float)
     for _ in range(2):  # removes noise, keeps curvature at the scale of the spacing
@@ -149,7 +142,8 @@ def _sorted_mesh(X, T, key=None):
     T = rank[T]
     a, b, c = T.T
     a_first, b_first = (a <= b) & (a <= c), b <= c  # least corner first, same orientation
-    T = np.where(a_first, T.T, np.where(b_first, (b, c, a), (c, a, b)))
+    turns = (a, b, c), (b, c, a), (c, a, b)
+    T = [np.where(a_first, x, np.where(b_first, y, z)) for x, y, z in turns]
     rows = surface.lexical_order(np.stack([T[2], T[0] * len(X) + T[1]], axis=1))
     return X[order], np.stack([corner.take(rows) for corner in T], axis=1), order
 

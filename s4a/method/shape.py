@@ -207,14 +207,9 @@ class Basis:
         return surface.edge_graph(self.X, surface.edges(self.T))
 
     @cached_property
-    def position_tree(self) -> cKDTree:
-        """KD-tree over the positions of the vertices."""
-        return cKDTree(self.X, balanced_tree=False, compact_nodes=False)
-
-    @cached_property
     def order(self) -> Array:
         """Order of the vertices in space, as :func:`s4a.geometry.mesh.order_in_space`."""
-        return self.position_tree.indices
+        return surface.order_in_space(self.X)
 
     @cached_property
     def outwards(self) -> Array:

@@ -209,7 +209,7 @@ def registration_score(source: Basis, target: Basis, match: Array, moved: Basis)
     n_samples = min(N_TRIPS, len(match))
     sample = target.outwards[np.linspace(0, len(match) - 1, n_samples).astype(int)]
     end = tree.query(source.tree.data[match[sample]])[1]
-    near = target.position_tree if len(X) > MANY else None
+    near = target.X if len(X) > MANY else None
     trip = path_lengths(target.graph, rows[sample], end, LONGEST_TRIP, near)
     return float(
         trip.mean() + distance.mean() + back_distance.mean() + _landmark_distance(source, target, X)
