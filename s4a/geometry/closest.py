@@ -21,7 +21,6 @@ POSITION_WEIGHT, NORMAL_WEIGHT = 5.0, 0.3
 # noise of a scan's normals, 0.1 and more, weighs less than several edges at 100,000 vertices
 _CLOSE_WEIGHT = 0.05
 _AT_ONCE = 4096  # points whose triangles are searched at once, in the cache
-Orders = tuple[Array | None, Array | None]
 _FLAT = 1e-14  # squared sine of the angle at A below which a triangle is degenerate
 
 
@@ -175,9 +174,7 @@ def feature_tree(X: Array, T: Array) -> FeatureTree:
     return FeatureTree(features(X, vertex_normals(X, T)))
 
 
-def match_surfaces(
-    Y: Array, normals_y: Array, X: Array, normals_x: Array, orders: Orders = (None, None)
-) -> Array:
+def match_surfaces(Y: Array, normals_y: Array, X: Array, normals_x: Array, *orders: Array) -> Array:
     """Match each vertex of a surface to the nearest vertex of a coinciding surface: ``(n,)``.
 
     Nearest in position and, with weight ``_CLOSE_WEIGHT``, in normal.
@@ -188,7 +185,7 @@ def match_surfaces(
         Query vertices and unit normals.
     X, normals_x : float ndarray (m, 3)
         Vertices and unit normals of the other surface, of about unit area.
-    orders : tuple of int ndarray, optional
+    *orders : int ndarray (n,), (m,), optional
         Orders of both in space, if computed before.
 
     Examples
@@ -201,8 +198,8 @@ def match_surfaces(
     >>> bool((match_surfaces(1.01 * X, N, X, N) == range(200)).all())
     True
     """
-    tree = FeatureTree(features(X, normals_x, weight=_CLOSE_WEIGHT), orders[1])
-    return tree.query(features(Y, normals_y, weight=_CLOSE_WEIGHT), orders[0])[1]
+    tree = FeatureTree(features(X, normals_x, weight=_CLOSE_WEIGHT), *orders[1:])
+    return tree.query(features(Y, normals_y, weight=_CLOSE_WEIGHT), *orders[:1])[1]
 
 
 def closest_point_on_triangles(P: Array, A: Array, B: Array, C: Array) -> Array:

@@ -483,7 +483,7 @@ def register_surface(
     results = _lowest_score(results)
     ((best, (score, moved)),) = results.items()
     if best != "intrinsic":
-        match = match_surfaces(moved.X, moved.normals, M.X, M.normals, (moved.order, M.order))
+        match = match_surfaces(moved.X, moved.normals, M.X, M.normals, moved.order, M.order)
     attrs |= {"initialisation": best, "score": score}
     return match, moved, attrs
 
@@ -635,8 +635,7 @@ def log_area_ratio(image: Array, X: Array, T: Array) -> Array:
     >>> (log_area_ratio(2 * X, X, T) + 0.0).tolist()
     [0.0, 0.0, 0.0]
     """
-    image, X = (surface.log_shares(vertex_areas(positions, T)) for positions in (image, X))
-    return image - X
+    return surface.log_shares(vertex_areas(image, T)) - surface.log_shares(vertex_areas(X, T))
 
 
 def common_unit(*meshes: xr.Dataset) -> str:

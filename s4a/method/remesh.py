@@ -141,9 +141,8 @@ def _sorted_mesh(X, T, key=None):
     rank[order] = np.arange(len(X))
     T = rank[T]
     a, b, c = T.T
-    a_first, b_first = (a <= b) & (a <= c), b <= c  # least corner first, same orientation
-    turns = (a, b, c), (b, c, a), (c, a, b)
-    T = [np.where(a_first, x, np.where(b_first, y, z)) for x, y, z in turns]
+    is_a, is_b = (a <= b) & (a <= c), b <= c  # least corner first, same orientation
+    T = [np.where(is_a, x, np.where(is_b, y, z)) for x, y, z in ((a, b, c), (b, c, a), (c, a, b))]
     rows = surface.lexical_order(np.stack([T[2], T[0] * len(X) + T[1]], axis=1))
     return X[order], np.stack([corner.take(rows) for corner in T], axis=1), order
 
