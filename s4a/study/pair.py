@@ -229,7 +229,7 @@ def _complete(source, target, initial, transform, k, options):
     if options.refine != "elastic":
         return registered(C := refined(C)), C, kept
     # elastic iterations do not use the functions
-    return *in_threads(lambda step: step(C), (registered, refined)), kept
+    return *in_threads(lambda step: step(C), (refined, registered))[::-1], kept
 
 
 def match_both(
