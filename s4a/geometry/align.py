@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from s4a.geometry.compiled import fpsample
+from s4a.geometry.mesh import norms
 from s4a.schema import Array
 
 RigidTransform = tuple[Array, Array]  # R (3, 3), t (3,)
@@ -105,13 +106,15 @@ def oscillation(P: Array) -> Array:
     distance from the mean: slowly enough for the rounding of files in single precision, quickly
     enough for neighbours.
     """
-    radius = np.linalg.norm(P - P.mean(0), axis=1)
+    radius = norms(P - P.mean(0))
     return np.sin(300 * radius / max(radius.mean(), 1e-300))
 
 
 def without_ties(P: Array, size: float = 1e-3) -> Array:
     """Move points ``(n, d)`` from their mean by at most `size` times the radius; few tie then."""
-    return P + size * oscillation(P)[:, None] * (P - P.mean(0))
+    offset = P - P.mean(0)
+    offset *= size * oscillation(P)[:, None]
+    return np.add(P, offset, out=offset)
 
 
 def farthest_points(P: Array, k: int) -> Array:
@@ -200,7 +203,7 @@ def many_farthest_points(P: Array, k: int, *, center: Array, seed: int = 0) -> A
     if k < 1:
         return np.arange(0)
     P = without_ties(P) - center
-    radius = np.linalg.norm(P, axis=1)
+    radius = norms(P)
     if not fpsample:
         if seed:
             opposite = P[np.argsort(-radius, kind="stable")[seed % len(P)]]
@@ -214,7 +217,8 @@ def many_farthest_points(P: Array, k: int, *, center: Array, seed: int = 0) -> A
     if seed:
         extra[0, :-1] = -P[np.argsort(-radius, kind="stable")[seed % len(P)]]
     points = np.concatenate([extra, np.c_[P, np.zeros(len(P))]])  # (n + 1, d + 1)
-    height = min(7, int(np.log2(len(points))))  # of the tree; each leaf needs a point
+    # of the tree; each leaf needs a point
+    height = min(depth := int(np.log2(len(points))), max(7, depth - 9))
     sample = fpsample.bucket_fps_kdline_sampling(points, k + 1, h=height, start_idx=0)
     _, first = np.unique(sample, return_index=True)
     return sample[np.sort(first)][1:].astype(np.int64) - 1

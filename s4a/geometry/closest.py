@@ -10,8 +10,9 @@ import scipy.sparse as sp
 from joblib import effective_n_jobs
 from scipy.spatial import cKDTree
 
+from s4a.geometry import mesh as surface
 from s4a.geometry.compiled import igl
-from s4a.geometry.mesh import counting_order, triangle_areas, triangle_normals, vertex_normals
+from s4a.geometry.mesh import order_in_space, triangle_areas, triangle_normals, vertex_normals
 from s4a.schema import Array
 
 # weights of positions (unit area) and unit normals in the search for nearest points
@@ -133,11 +134,13 @@ def features(
 
 
 class FeatureTree:
-    """KD-tree over rows of :func:`features`, in the order of whose leaves the rows lie in memory.
+    """KD-tree over rows of :func:`features`, in whose memory rows near in space lie together.
 
     Parameters
     ----------
     rows : float ndarray (n, d)
+    order : int ndarray (n,), optional
+        Order of the rows in space, :func:`s4a.geometry.mesh.order_in_space` by default.
 
     Examples
     --------
@@ -147,20 +150,23 @@ class FeatureTree:
     [1]
     """
 
-    def __init__(self, rows: Array) -> None:
-        # the leaf size suits queries in the order of a mesh
-        options = {"leafsize": 32, "balanced_tree": False}
+    def __init__(self, rows: Array, order: Array | None = None) -> None:
         self.data = rows
-        self._order = cKDTree(rows, **options).indices
-        self._tree = cKDTree(rows.take(self._order, axis=0), **options)
+        self._order = order_in_space(rows) if order is None else order
+        # the leaf size suits queries far from the rows, which take most of the time
+        self._tree = cKDTree(rows.take(self._order, axis=0), leafsize=64, balanced_tree=False)
 
-    def query(self, rows: Array) -> tuple[Array, Array]:
+    def query(self, rows: Array, order: Array | None = None) -> tuple[Array, Array]:
         """Return the distance and the index of the nearest row, for each of some rows (q, d).
 
-        In as many threads as ``joblib.parallel_config`` says, one by default.
+        In their order in space, and in as many threads as ``joblib.parallel_config`` says, one by
+        default.
         """
-        distance, nearest = self._tree.query(rows, workers=effective_n_jobs(None))
-        return distance, self._order.take(nearest)
+        order = order_in_space(rows) if order is None else order
+        found = self._tree.query(rows.take(order, axis=0), workers=effective_n_jobs(None))
+        distance, nearest = np.empty(len(rows)), np.empty(len(rows), np.int64)
+        distance[order], nearest[order] = found[0], self._order.take(found[1])
+        return distance, nearest
 
 
 def feature_tree(X: Array, T: Array) -> FeatureTree:
@@ -168,7 +174,7 @@ def feature_tree(X: Array, T: Array) -> FeatureTree:
     return FeatureTree(features(X, vertex_normals(X, T)))
 
 
-def match_surfaces(Y: Array, normals_y: Array, X: Array, normals_x: Array) -> Array:
+def match_surfaces(Y: Array, normals_y: Array, X: Array, normals_x: Array, *orders: Array) -> Array:
     """Match each vertex of a surface to the nearest vertex of a coinciding surface: ``(n,)``.
 
     Nearest in position and, with weight ``_CLOSE_WEIGHT``, in normal.
@@ -179,6 +185,8 @@ def match_surfaces(Y: Array, normals_y: Array, X: Array, normals_x: Array) -> Ar
         Query vertices and unit normals.
     X, normals_x : float ndarray (m, 3)
         Vertices and unit normals of the other surface, of about unit area.
+    *orders : int ndarray (n,), (m,), optional
+        Orders of both in space, if computed before.
 
     Examples
     --------
@@ -190,8 +198,8 @@ def match_surfaces(Y: Array, normals_y: Array, X: Array, normals_x: Array) -> Ar
     >>> bool((match_surfaces(1.01 * X, N, X, N) == range(200)).all())
     True
     """
-    tree = FeatureTree(features(X, normals_x, weight=_CLOSE_WEIGHT))
-    return tree.query(features(Y, normals_y, weight=_CLOSE_WEIGHT))[1]
+    tree = FeatureTree(features(X, normals_x, weight=_CLOSE_WEIGHT), *orders[1:])
+    return tree.query(features(Y, normals_y, weight=_CLOSE_WEIGHT), *orders[:1])[1]
 
 
 def closest_point_on_triangles(P: Array, A: Array, B: Array, C: Array) -> Array:
@@ -313,10 +321,9 @@ def stars(T: Array, n: int) -> Stars:
     >>> around.degree.tolist(), around.triangle[around.start[3] :].tolist()
     ([1, 2, 2, 1], [1])
     """
-    corner = counting_order(T.ravel(), n)
+    corner, first = surface.counting_sort(T.ravel(), n)
     b, c = (np.roll(T, shift, axis=1).ravel().take(corner) for shift in (-1, -2))
-    degree = np.bincount(T.ravel(), minlength=n)
-    return Stars(corner, (b, c), np.cumsum(degree) - degree, degree)
+    return Stars(corner, (b, c), first[:-1], np.diff(first))
 
 
 def closest_point_in_star(

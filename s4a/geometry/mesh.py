@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from s4a.schema import Array, dataset
 
-_BLOCK = 1 << 14  # triangles whose corners are in the cache at once
+_BLOCK = 1 << 12  # triangles whose corners are in the cache at once
 
 
 def as_dataset(
@@ -47,29 +47,43 @@ def _normals_in_blocks(X, T):
     X = np.asarray(X, float)  # products of integers may overflow
     for start in range(0, len(T), _BLOCK):
         block = slice(start, start + _BLOCK)
-        a, b, c = (X.take(corner, axis=0) for corner in T[block].T)
-        ux, uy, uz = (b - a).T
-        vx, vy, vz = (c - a).T
+        a, b, c = (X.take(corner, axis=0) for corner in T[block].T.astype(np.intp, order="C"))
+        b -= a
+        c -= a
+        (ux, uy, uz), (vx, vy, vz) = b.T, c.T
         # written out: np.cross gives the same bits and takes twice as long
         yield block, (uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx)
 
 
 def triangle_areas(X: Array, T: Array) -> Array:
     """Return the areas of the triangles ``(m,)``."""
-    areas = np.empty(len(T))
-    for block, (x, y, z) in _normals_in_blocks(X, T):
-        areas[block] = 0.5 * np.sqrt(x * x + y * y + z * z)
-    return areas
+    return 0.5 * norms(triangle_normals(X, T))
 
 
 def vertex_areas(X: Array, T: Array) -> Array:
     """Return lumped (barycentric) vertex areas ``(n,)``: a third of each incident triangle."""
-    return np.bincount(T.ravel(), np.repeat(triangle_areas(X, T) / 3, 3), len(X))
+    return sums_at_vertices(T, triangle_areas(X, T) / 3, len(X))
 
 
-def log_area_shares(X: Array, T: Array) -> Array:
-    """Return logarithms of the shares of the vertices in the area of the surface ``(n,)``."""
-    area = vertex_areas(X, T)
+def sums_at_vertices(T: Array, values: Array, n: int) -> Array:
+    """Return sums ``(n, ...)`` of values ``(m, ...)`` of the triangles around each vertex.
+
+    Equal to :func:`numpy.bincount` for every column, in one pass.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from s4a.geometry.mesh import sums_at_vertices
+    >>> sums_at_vertices(np.array([[0, 1, 2], [2, 1, 3]]), np.array([1.0, 2.0]), 4).tolist()
+    [1.0, 3.0, 3.0, 2.0]
+    """
+    _check_numbers(T, n)  # others would be written outside of the sums
+    corner = sp.csr_matrix((np.ones(T.size), T.ravel(), np.arange(0, T.size + 1, 3)), (len(T), n))
+    return corner.T @ values  # adds in the order of the triangles
+
+
+def log_shares(area: Array) -> Array:
+    """Return logarithms ``(n,)`` of the shares of the vertices in the area of a surface."""
     return np.log(np.maximum(area / area.sum(), np.finfo(np.float32).tiny))
 
 
@@ -83,16 +97,30 @@ def normal_sums(X: Array, T: Array) -> Array:
     >>> normal_sums(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]))[0]
     array([0., 0., 1.])
     """
-    corners, normals = T.ravel(), triangle_normals(X, T)
-    sums = [np.bincount(corners, np.repeat(column, 3), len(X)) for column in normals.T]
-    return np.stack(sums, axis=1)
+    return sums_at_vertices(T, triangle_normals(X, T), len(X))
 
 
 def vertex_normals(X: Array, T: Array) -> Array:
     """Return area-weighted unit normals of the vertices ``(n, 3)``; zero without area."""
-    N = normal_sums(X, T)
-    length = np.linalg.norm(N, axis=1, keepdims=True)
-    return N / np.where(length > 0, length, 1)
+    return normals_and_areas(X, T)[0]
+
+
+def normals_and_areas(X: Array, T: Array) -> tuple[Array, Array]:
+    """Return :func:`vertex_normals` and :func:`vertex_areas`, from one pass over triangles."""
+    values = np.empty((len(T), 4))
+    for block, (x, y, z) in _normals_in_blocks(X, T):
+        values[block] = np.stack([x, y, z, 0.5 * np.sqrt(x * x + y * y + z * z) / 3], axis=1)
+    sums = sums_at_vertices(T, values, len(X))
+    length = norms(sums[:, :3])
+    return sums[:, :3] / np.where(length > 0, length, 1)[:, None], sums[:, 3].copy()
+
+
+def norms(vectors: Array) -> Array:
+    """Return the lengths of vectors ``(n, d)``, d < 8, as :func:`numpy.linalg.norm` does.
+
+    It takes three times as long for many vectors of few dims.
+    """
+    return np.sqrt(sum(column * column for column in vectors.T))
 
 
 def rotated(vectors: Array, start: Array, end: Array) -> Array:
@@ -132,7 +160,23 @@ def edges(T: Array) -> Array:
     >>> edges(np.array([[0, 1, 2], [2, 1, 3]])).tolist()
     [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
     """
-    return unique_edges(T)[0]
+    return counted_edges(T)[0]
+
+
+def counted_edges(T: Array, n: int | None = None) -> tuple[Array, Array]:
+    """Return the undirected edges ``(e, 2)`` and the triangles per edge ``(e,)``.
+
+    In a third of the time of :func:`unique_edges`, where the arguments are explained.
+    """
+    start = np.asarray(T).T.ravel()  # as in directed_edges
+    n = int(start.max(initial=0)) + 1 if n is None else n
+    _check_numbers(start, n)
+    start = start.astype(np.int32 if n < 2**31 else np.int64, copy=False)  # the smaller, the faster
+    end = np.roll(start, -len(T))
+    ends = np.minimum(start, end), np.maximum(start, end)
+    count = sp.coo_matrix((np.ones(len(start), np.int32), ends), (n, n)).tocsr()  # adds equal edges
+    first = np.repeat(np.arange(n), np.diff(count.indptr))
+    return np.stack([first, count.indices], axis=1, dtype=np.int64), count.data
 
 
 def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
@@ -153,23 +197,11 @@ def unique_edges(T: Array, n: int | None = None) -> tuple[Array, Array, Array]:
     count : int ndarray (e,)
         Triangles at the edge: 2 in the interior of a manifold, 1 on its boundary.
     """
-    start = np.asarray(T).T.ravel()  # as in directed_edges
-    n = int(start.max(initial=0)) + 1 if n is None else n
-    _check_numbers(start, n)
-    start = start.astype(np.int32 if n < 2**31 else np.int64, copy=False)  # the smaller, the faster
-    end = np.roll(start, -len(T))
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    order = counting_order(low, n)
-    first = np.r_[0, np.cumsum(np.bincount(low, minlength=n))]
-    rows = sp.csr_matrix((order, high.take(order), first), (n, n))
-    rows.sort_indices()
-    order, low = rows.data, low.take(rows.data)  # half-edges, sorted by both ends
-    new = np.ones(len(low), bool)
-    new[1:] = (low[1:] != low[:-1]) | (rows.indices[1:] != rows.indices[:-1])
-    edge_of = np.empty(len(low), np.int64)
-    edge_of[order] = np.cumsum(new) - 1
-    E = np.stack([low[new], rows.indices[new]], axis=1).astype(np.int64)
-    return E, edge_of, np.bincount(edge_of)
+    E, count = counted_edges(T, n)
+    if len(E) == 0:
+        return E, np.zeros(0, np.int64), count
+    number, ends = sp.csr_matrix((np.arange(len(E)), E.T)), directed_edges(T).T
+    return E, np.asarray(number[ends.min(0), ends.max(0)]).ravel(), count
 
 
 def _check_numbers(key, n):
@@ -190,10 +222,15 @@ def counting_order(key: Array, n: int) -> Array:
     >>> counting_order(np.array([2, 0, 1, 0]), 3).tolist()
     [1, 3, 2, 0]
     """
+    return counting_sort(key, n)[0].astype(np.int64)
+
+
+def counting_sort(key: Array, n: int) -> tuple[Array, Array]:
+    """Return :func:`counting_order` and the first element of each integer in it ``(n + 1,)``."""
     _check_numbers(key, n)  # others would be written outside of the arrays
     m = len(key)
-    indicator = sp.csr_matrix((np.empty(m, np.int8), key, np.arange(m + 1)), (m, n))
-    return indicator.tocsc().indices.astype(np.int64)
+    indicator = sp.csr_matrix((np.empty(m, np.int8), key, np.arange(m + 1)), (m, n)).tocsc()
+    return indicator.indices, indicator.indptr
 
 
 def order_in_space(X: Array) -> Array:
@@ -279,8 +316,8 @@ def components(pairs: Array, n: int) -> Array:
 
 def edge_graph(X: Array, E: Array) -> sp.csr_matrix:
     """Return the lengths of the edges E ``(e, 2)`` as a symmetric sparse matrix ``(n, n)``."""
-    i, j = E.T
-    length = np.linalg.norm(X[i] - X[j], axis=1)  # (e,)
+    i, j = E.T.astype(np.int32 if len(X) < 2**31 else np.int64, order="C")
+    length = norms(X.take(i, axis=0) - X.take(j, axis=0))  # (e,)
     least = 1e-12 * (length.max(initial=0) or 1)  # an explicit zero would count as no edge
     half = sp.coo_matrix((np.maximum(length, least), (i, j)), (len(X), len(X))).tocsr()
     return half + half.T
@@ -318,9 +355,9 @@ def path_lengths(
     edge = np.asarray(G[start, end]).ravel()
     length = np.where(start == end, 0.0, np.where(edge > 0, edge, np.inf))
     if X is not None:
-        _find_short_paths(X, G, start, end, 0.1 * limit, length)
+        _find_short_paths(X, G, start, end, 0.5 * limit, length)
     step = max(1, min(64, 2**22 // G.shape[0]))  # origins at a time: at most 32 MB of distances
-    for reach in (0.1 * limit, limit):
+    for reach in (0.1 * limit, limit) if X is None else (limit,):
         missing = np.flatnonzero(np.isinf(length))
         origin, row = np.unique(start[missing], return_inverse=True)
         for first in range(0, len(origin), step):
@@ -331,14 +368,18 @@ def path_lengths(
 
 
 def _find_short_paths(X, G, start, end, longest, length):
-    """Enter paths of at most three times the distance of their ends, and at most `longest`."""
-    reach = 3 * np.linalg.norm(X[start] - X[end], axis=1)
-    pair = np.flatnonzero(np.isinf(length) & (reach < longest))
-    tree = cKDTree(X, balanced_tree=False, compact_nodes=False)
-    balls = tree.query_ball_point(X[start[pair]], reach[pair], return_sorted=True)
-    for i, ball in zip(pair, map(np.array, balls), strict=True):
-        first, last = np.searchsorted(ball, (start[i], end[i]))
-        length[i] = dijkstra(G[ball][:, ball], indices=first, limit=reach[i])[last]
+    """Enter paths of at most 1.5 times the distance of their ends, then 2.25, ..., and `longest`.
+
+    A path of at most a length lies in the ball of this diameter around the middle of its ends.
+    """
+    tree, P, Q = cKDTree(X, balanced_tree=False, compact_nodes=False), X[start], X[end]
+    reach = np.maximum(1.5 * norms(P - Q), 0.01 * longest)
+    while len(pair := np.flatnonzero(np.isinf(length) & (reach < longest))):
+        balls = tree.query_ball_point((P + Q)[pair] / 2, reach[pair] * 0.5001, return_sorted=True)
+        for i, ball in zip(pair, map(np.array, balls), strict=True):
+            first, last = np.searchsorted(ball, (start[i], end[i]))
+            length[i] = dijkstra(G[ball][:, ball], indices=first, limit=reach[i])[last]
+        reach *= 1.5
 
 
 def half_cotangents(X: Array, T: Array) -> Array:

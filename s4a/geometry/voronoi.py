@@ -15,8 +15,9 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from s4a.geometry import mesh as surface
 from s4a.geometry.align import oscillation
-from s4a.geometry.mesh import components, directed_edges, edge_graph, triangle_areas, unique_edges
+from s4a.geometry.mesh import components, directed_edges, edge_graph, triangle_areas
 from s4a.schema import Array
 
 
@@ -53,7 +54,7 @@ def mesh_graph(X: Array, T: Array, found: tuple[Array, Array] | None = None) -> 
     `found` are the edges and the triangles per edge, if they are known.
     Lengths change by at most a hundredth, so that few vertices are equally far from two samples.
     """
-    E, count = found or unique_edges(T, len(X))[::2]
+    E, count = found or surface.counted_edges(T, len(X))
     G, factor = edge_graph(X, E), 1 + 0.005 * oscillation(X)
     G.data *= np.repeat(factor, np.diff(G.indptr))
     G.data *= factor.take(G.indices)
@@ -94,11 +95,14 @@ def add_samples(G: sp.csr_matrix, new: Array, state: Voronoi) -> Voronoi:
 def voronoi_cells(G: sp.csr_matrix, sample: Array) -> Voronoi:
     """Return Voronoi cells of samples, with a sample added in each component without one."""
     n = G.shape[0]
-    _, component = connected_components(G, directed=False)
-    _, first = np.unique(component, return_index=True)
-    sample = np.union1d(sample, first[~np.isin(component[first], component[sample])])
     empty = Voronoi(np.empty(0, np.int64), np.full(n, -1), np.full(n, np.inf))
-    return add_samples(G, sample, empty)
+    state = add_samples(G, np.unique(sample), empty)
+    if np.isinf(state.distance).any():
+        _, component = connected_components(G, directed=False)
+        _, first = np.unique(component, return_index=True)
+        sample = np.union1d(sample, first[~np.isin(component[first], component[sample])])
+        state = add_samples(G, sample, empty)
+    return state
 
 
 def dual(T: Array, cell: Array) -> Array:
@@ -336,7 +340,7 @@ def cut_handles(X: Array, T: Array, removed: Array, crumb: float) -> tuple[Array
         Index of each vertex in the given mesh, -1 for the centres.
     """
     n, area = len(X), triangle_areas(X, T)
-    E, edge_of, count = unique_edges(T, n)
+    E, edge_of, count = surface.unique_edges(T, n)
     component = components(E, n)
 
     def left_at_edge():

@@ -17,6 +17,7 @@ from s4a.geometry.mesh import (
     as_arrays,
     as_dataset,
     components,
+    counted_edges,
     counting_order,
     directed_edges,
     equal_rows,
@@ -161,7 +162,7 @@ def clean_arrays(
     X, T, boundary = P[file_vertex], V, directed_edges(V)[mate < 0]
     if any(counts[kind] for kind in ("nonmanifold_edges", "cut_edges", "split_vertices")):
         X, T, file_vertex = _split_double_edges(X, V, file_vertex, mate, counts)
-        E, _, count = unique_edges(T, len(X))
+        E, count = counted_edges(T, len(X))
         boundary = E[count == 1]
     T, is_kept = _keep_components(X, T, boundary, components, counts)
     new = np.where(is_kept, np.cumsum(is_kept) - 1, -1)

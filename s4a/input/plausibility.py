@@ -25,7 +25,7 @@ from s4a.geometry.crossing import can_count, count_crossing
 from s4a.geometry.mesh import (
     as_arrays,
     components,
-    unique_edges,
+    counted_edges,
     vertex_areas,
     vertex_normals,
     volume,
@@ -93,7 +93,7 @@ def describe(mesh: xr.Dataset, *, intersections: bool = True) -> xr.Dataset:
     skewness = area @ along**3 / total / np.maximum(variance, 1e-300) ** 1.5
     size = np.sqrt(variance.sum())
     vertex = np.linspace(0, len(X) - 1, min(len(X), N_POINTS)).astype(int)
-    edge, _, count = unique_edges(T, len(X))
+    edge, count = counted_edges(T, len(X))
     length = np.linalg.norm(X[edge[:, 0]] - X[edge[:, 1]], axis=1)
     number = count_crossing(mesh["position"].values, T) if intersections else -1
     descriptor = dataset(

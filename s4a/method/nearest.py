@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from s4a.geometry.mesh import counting_order
+from s4a.geometry.mesh import counting_sort
 from s4a.schema import Array
 
 BLOCK = 512  # cells of queries whose distances to all other cells are in memory at once
@@ -206,20 +206,20 @@ def into_cells(rows: Rows, cell: Array, middle: Array | float = 0.0) -> Cells:
     """Group rows `(n, d)`, less `middle`, by their cell numbers `(n,)`, without empty cells."""
     _, cell = np.unique(cell, return_inverse=True)
     count = np.bincount(cell)
-    order = counting_order(cell, len(count))
+    order, start = counting_sort(cell, len(count))
     in_order = np.empty(rows.shape, np.float32)
     for i in range(0, len(order), _BLOCK_OF_ROWS):  # no second copy of all rows
         some = slice(i, i + _BLOCK_OF_ROWS)
-        in_order[some] = rows[order[some]] - middle
-    rows = in_order
-    start = np.concatenate([[0], np.cumsum(count)])
-    center = np.add.reduceat(rows, start[:-1], axis=0) / count[:, None].astype(np.float32)
-    distance = np.empty(len(rows), np.float32)
-    for i in range(0, len(count), BLOCK):
-        begin, end = start[[i, min(i + BLOCK, len(count))]]
-        offset = rows[begin:end] - np.repeat(center[i : i + BLOCK], count[i : i + BLOCK], axis=0)
-        distance[begin:end] = np.linalg.norm(offset, axis=1)
-    return Cells(rows, order, start, center, np.maximum.reduceat(distance, start[:-1]) * _SLACK)
+        np.subtract(rows[order[some]], middle, out=in_order[some], casting="same_kind")
+    ones = np.ones(len(order), np.float32)
+    sums = sp.csr_matrix((ones, np.arange(len(order)), start), (len(count), len(order))) @ in_order
+    center = sums / count[:, None].astype(np.float32)
+    distance, cell = np.empty(len(order), np.float32), np.sort(cell)
+    for i in range(0, len(order), _BLOCK_OF_ROWS):
+        some = slice(i, i + _BLOCK_OF_ROWS)
+        distance[some] = np.linalg.norm(in_order[some] - center.take(cell[some], axis=0), axis=1)
+    radius = np.maximum.reduceat(distance, start[:-1]) * _SLACK
+    return Cells(in_order, order.astype(np.int64), start, center, radius)
 
 
 def _squared_distances(A, B):

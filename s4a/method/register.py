@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from s4a.geometry import mesh as surface
 from s4a.geometry.align import RigidTransform
 from s4a.geometry.closest import closest_point_in_star, interpolate, match_surfaces
-from s4a.geometry.mesh import as_arrays, log_area_shares, triangle_areas
+from s4a.geometry.mesh import as_arrays, norms, triangle_areas, vertex_areas
 from s4a.method import spectral_icp
 from s4a.method.deform import displacement_in_template, distortion
 from s4a.method.elastic import (
@@ -63,11 +64,8 @@ def stretch(X: Array, image: Array, T: Array) -> Array:
     before = triangle_areas(X, T)
     squared = (area**2 + conformal**2) / 2  # log(s1)^2 + log(s2)^2
     squared = np.minimum(np.where(np.isnan(squared), 0.0, squared), 100.0)  # degenerate, collapsed
-    corners = T.ravel()
-    total, weight = (
-        np.bincount(corners, np.repeat(values, 3), len(X)) for values in (before * squared, before)
-    )
-    return np.sqrt(total / np.maximum(weight, np.finfo(float).tiny))
+    sums = surface.sums_at_vertices(T, np.stack([before * squared, before], axis=1), len(X))
+    return np.sqrt(sums[:, 0] / np.maximum(sums[:, 1], np.finfo(float).tiny))
 
 
 def confidence_features(source: Shape, target: Shape, match: Array, P: Array) -> Array:
@@ -463,14 +461,7 @@ def register_surface(
     if elastic:
         warps = {n: candidates[n].warp for n in names if candidates[n].warp[0].ndim == 2}
         names = [name for name in names if name not in warps]  # piecewise rigid
-        surfaces = elastic_surfaces(source, target, warps)
-        results = _scored(M, N, surfaces, "elastic")
-        limit = MAX_STRAIN * (1 - _STRAIN_REDUCTION if len(target.low.X) < FEW else 1)
-        if results and strain_quantile(results[_lowest_score(results)][1], N) > limit:
-            strained = results[_lowest_score(results)]
-            surfaces = elastic_surfaces(source, target, warps, less_stiff=True)
-            scored = _scored(M, N, surfaces, "looser")
-            results |= {name: r for name, r in scored.items() if improves(r, strained, N)}
+        results = _elastic_result(source, target, warps) if warps else {}
     for name in names:
         if name == "intrinsic":
             match, compared, certified = match_functions(source, target, *functions)
@@ -489,17 +480,31 @@ def register_surface(
         else:
             moved = N.moved_to(spectral_icp.move(N, warp))
             results[name] = spectral_icp.registration_score(M, N, match_near, moved), moved
-    best = _lowest_score(results)
-    score, moved = results[best]
+    results = _lowest_score(results)
+    ((best, (score, moved)),) = results.items()
     if best != "intrinsic":
-        match = match_surfaces(moved.X, moved.normals, M.X, M.normals)
+        match = match_surfaces(moved.X, moved.normals, M.X, M.normals, moved.order, M.order)
     attrs |= {"initialisation": best, "score": score}
     return match, moved, attrs
 
 
 def _lowest_score(results):
-    """Name of the result with the lowest score."""
-    return min(results, key=lambda name: results[name][0])
+    """Result with the lowest score, by its name; others can be freed."""
+    best = min(results, key=lambda name: results[name][0])
+    return {best: results[best]}
+
+
+def _elastic_result(source, target, warps):
+    """Score and registered target of elastic iterations, less stiff ones if its strain is large."""
+    N = target.full
+    results = _lowest_score(_scored(source.full, N, elastic_surfaces(source, target, warps)))
+    (strained,) = results.values()
+    limit = MAX_STRAIN * (1 - _STRAIN_REDUCTION if len(target.low.X) < FEW else 1)
+    if strain_quantile(strained[1], N) > limit:
+        surfaces = elastic_surfaces(source, target, warps, less_stiff=True)
+        scored = _scored(source.full, N, surfaces, "looser")
+        results |= {name: r for name, r in scored.items() if improves(r, strained, N)}
+    return _lowest_score(results)
 
 
 def strain_quantile(moved: Basis, target: Basis) -> float:
@@ -520,7 +525,7 @@ def improves(result: tuple[float, Basis], strained: tuple[float, Basis], target:
     return after < _MAX_REMAINING * before
 
 
-def _scored(source, target, surfaces, step):
+def _scored(source, target, surfaces, step="elastic"):
     """Score and registered target of each surface, by the name of its initialisation and step."""
     scored = in_threads(lambda X: _score_nearest(source, target, X), surfaces.values())
     return dict(zip([f"{name}+{step}" for name in surfaces], scored, strict=True))
@@ -606,16 +611,15 @@ def closest_on_template(source: Basis, moved: Basis) -> tuple[Array, Array]:
     triangle : int ndarray (n_source,)
     barycentric : float ndarray (n_source, 3)
     """
-    nearest = moved.tree.query(source.tree.data)[1]
+    nearest = moved.tree.query(source.tree.data, source.order)[1]
     return closest_point_in_star(source.X, nearest, moved.X, moved.T)
 
 
 def round_trip(target: Shape, match: Array, triangle: Array, barycentric: Array) -> Array:
     """Distance after template -> shape -> template ``(n_target,)``, as a share of sqrt(area)."""
-    X = target.full.X
-    corner = X[target.full.T[triangle[match]]]  # (n_target, 3 corners, 3)
-    back = np.einsum("nc,ncx->nx", barycentric[match], corner)
-    return np.linalg.norm(back - X, axis=1)
+    X, T = target.full.X, target.full.T
+    back = interpolate(X, T, triangle[match], barycentric[match])
+    return norms(back - X)
 
 
 def log_area_ratio(image: Array, X: Array, T: Array) -> Array:
@@ -631,7 +635,7 @@ def log_area_ratio(image: Array, X: Array, T: Array) -> Array:
     >>> (log_area_ratio(2 * X, X, T) + 0.0).tolist()
     [0.0, 0.0, 0.0]
     """
-    return log_area_shares(image, T) - log_area_shares(X, T)
+    return surface.log_shares(vertex_areas(image, T)) - surface.log_shares(vertex_areas(X, T))
 
 
 def common_unit(*meshes: xr.Dataset) -> str:

@@ -29,7 +29,7 @@ from s4a.geometry import voronoi
 from s4a.geometry.align import many_farthest_points, without_ties
 from s4a.geometry.closest import closest_point, closest_point_in_star
 from s4a.geometry.compiled import robust_laplacian
-from s4a.geometry.mesh import as_arrays, triangle_areas, vertex_areas, vertex_normals
+from s4a.geometry.mesh import as_arrays, norms, triangle_areas, vertex_areas, vertex_normals
 from s4a.input.collection import Mesh, as_mesh
 from s4a.options import check
 from s4a.schema import Array, check_count, dataset
@@ -65,13 +65,12 @@ def sample_surface(
     -------
     int ndarray, sorted
     """
-    area = vertex_areas(X, T)
+    N, area = surface.normals_and_areas(X, T)
     spacing = np.sqrt(2 / np.sqrt(3) * area.sum() / k)  # edge of equilateral triangles
-    N = vertex_normals(X, T)
     ring = G.astype(bool).astype(float)
     for _ in range(2):  # removes noise, keeps curvature at the scale of the spacing
-        N = N + ring @ N
-        N /= np.maximum(np.linalg.norm(N, axis=1, keepdims=True), 1e-300)
+        N += ring @ N
+        N /= np.maximum(norms(N), 1e-300)[:, None]
     X = X - area @ X / area.sum()
     P = np.c_[X / spacing, N]  # (n, 6)
     center = np.zeros(6)
@@ -141,10 +140,11 @@ def _sorted_mesh(X, T, key=None):
     rank = np.empty(len(X), np.int64)
     rank[order] = np.arange(len(X))
     T = rank[T]
-    cyclic = (T.argmin(1)[:, None] + np.arange(3)) % 3  # least corner first, same orientation
-    T = np.take_along_axis(T, cyclic, axis=1)
-    first_two = T[:, 0] * len(X) + T[:, 1]
-    return X[order], T[surface.lexical_order(np.stack([T[:, 2], first_two], axis=1))], order
+    a, b, c = T.T
+    is_a, is_b = (a <= b) & (a <= c), b <= c  # least corner first, same orientation
+    T = [np.where(is_a, x, np.where(is_b, y, z)) for x, y, z in ((a, b, c), (b, c, a), (c, a, b))]
+    rows = surface.lexical_order(np.stack([T[2], T[0] * len(X) + T[1]], axis=1))
+    return X[order], np.stack([corner.take(rows) for corner in T], axis=1), order
 
 
 def _coarse_surface(X, T, found, n_coarse, seed=0, sampling="normals"):
@@ -293,7 +293,7 @@ def check_clean(X: Array, T: Array) -> tuple[dict[str, int], tuple[Array, Array]
         Unless positions are finite, indices valid, vertices in use and edges manifold.
     """
     _check_numbers(X, T)
-    found = surface.unique_edges(T, len(X))[::2]
+    found = surface.counted_edges(T, len(X))
     counts = topology(T, *found)
     unused, nonmanifold = len(X) - surface.n_used(T), counts["nonmanifold_edges"]
     if unused or nonmanifold:
@@ -422,7 +422,7 @@ def coarsen(
     V, F = X, T
     if wrap:
         V, F, _ = _sorted_mesh(*alpha_wrap(X, T))
-        found = surface.unique_edges(F, len(V))[::2]
+        found = surface.counted_edges(F, len(V))
     if len(V) <= n_coarse:
         Y, C = V, F
         sample = cell = np.arange(len(V))
@@ -448,7 +448,7 @@ def coarsen(
         shares = weight * vertex_areas(X, T)[:, None]
         area = np.bincount(corner.ravel(), shares.ravel(), len(Y))
     E, w, area, attrs["laplacian"] = laplacian(Y, C, area)
-    attrs |= topology(C, *surface.unique_edges(C)[::2])
+    attrs |= topology(C, *surface.counted_edges(C))
     attrs |= {f"{name}_original": count for name, count in before.items()}
     rank = np.argsort(order)  # back to the numbering of the input
     return dataset(

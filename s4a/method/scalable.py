@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from s4a.geometry.align import farthest_points
-from s4a.geometry.mesh import as_arrays, edge_graph, stiffness, unique_edges, vertex_areas
+from s4a.geometry.mesh import as_arrays, counted_edges, edge_graph, stiffness, vertex_areas
 from s4a.geometry.voronoi import add_samples, dual, farthest_of_each, voronoi_cells
 from s4a.method.remesh import check_clean, laplacian, sample_surface
 from s4a.method.shape import Basis, Shape
@@ -73,7 +73,7 @@ def covering_samples(
     G : sparse matrix (n, n)
         Edge lengths.
     """
-    E, _, count = unique_edges(T, len(X))
+    E, count = counted_edges(T, len(X))
     G = edge_graph(X, E)
     initial = sample_surface(X, T, G, E[count == 1], np.zeros(len(X), bool), min(p, len(X)), seed)
     radius = _RADIUS * np.sqrt(vertex_areas(X, T).sum() / (np.pi * len(initial)))

@@ -101,7 +101,9 @@ class Basis:
 
     def moved_to(self, X: Array) -> "Basis":
         """Return the surface with vertices moved to X ``(n, 3)``, as registered."""
-        return replace(self, X=X, surface_normals=None)
+        moved = replace(self, X=X, surface_normals=None)
+        vars(moved)["order"] = self.order  # replaces the cached property
+        return moved
 
     def extend(self, F: Array) -> Array | Product:
         """Extend functions of the low resolution to all vertices: U F ``(n, q)``, by rows.
@@ -145,13 +147,13 @@ class Basis:
     @cached_property
     def tree(self) -> FeatureTree:
         """KD-tree over position and normal of the vertices, 6 dims."""
-        return FeatureTree(features(self.X, self.normals))
+        return FeatureTree(features(self.X, self.normals), self.order)
 
     def guided_tree(self, names: tuple[str, ...]) -> FeatureTree:
         """Return the KD-tree over position, normal and some fields, 6 dims and one for each."""
         if names not in self._trees:
             rows = np.concatenate([self.tree.data, field_columns(self, names)], axis=1)
-            self._trees[names] = FeatureTree(rows)
+            self._trees[names] = FeatureTree(rows, self.order)
         return self._trees[names]
 
     @cached_property
@@ -161,7 +163,7 @@ class Basis:
     @cached_property
     def normals(self) -> Array:
         """Unit normals of the vertices ``(n, 3)``."""
-        return vertex_normals(self.X, self.T)
+        return self._normals_and_areas[0]
 
     def normals_at(self, X: Array) -> Array:
         """Return unit normals ``(n, 3)`` after moving the vertices to X.
@@ -177,7 +179,11 @@ class Basis:
     @cached_property
     def log_area_shares(self) -> Array:
         """Logarithms of the shares of the vertices in the area ``(n,)``."""
-        return surface.log_area_shares(self.X, self.T)
+        return surface.log_shares(self._normals_and_areas[1])
+
+    @cached_property
+    def _normals_and_areas(self) -> tuple[Array, Array]:
+        return surface.normals_and_areas(self.X, self.T)
 
     @cached_property
     def stars(self) -> Stars:
@@ -199,6 +205,11 @@ class Basis:
     def graph(self) -> sp.csr_matrix:
         """Lengths of the edges as a sparse matrix ``(n, n)``."""
         return surface.edge_graph(self.X, surface.edges(self.T))
+
+    @cached_property
+    def order(self) -> Array:
+        """Order of the vertices in space, as :func:`s4a.geometry.mesh.order_in_space`."""
+        return surface.order_in_space(self.X)
 
     @cached_property
     def outwards(self) -> Array:

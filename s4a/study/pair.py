@@ -212,16 +212,24 @@ def _complete(source, target, initial, transform, k, options):
     kept: list[tuple[np.ndarray, np.ndarray]] = []
     keep = (lambda *pair: kept.append(pair)) if options.keep_iterations else None
     C, match = fmap.zoomout(M, N, initial.C, k, step=options.step, keep=keep)
-    for _ in range(options.full_resolution_iterations):
-        C = refine_at_full_resolution(
-            source, target, C, source.full.Phi if source.has_refined_eigenfunctions else None
-        )
-    initial_matches = {"intrinsic": match, "icp": initial.near}
-    functions = source.functions(C.T), target.functions(np.eye(k))  # eq. 4 compares rows of both
-    registration = register(
-        source, target, initial_matches, functions, transform, k=k, **options.of("registration")
-    )
-    return registration, C, kept
+
+    def refined(C):
+        for _ in range(options.full_resolution_iterations):
+            C = refine_at_full_resolution(
+                source, target, C, source.full.Phi if source.has_refined_eigenfunctions else None
+            )
+        return C
+
+    def registered(C):
+        matches = {"intrinsic": match, "icp": initial.near}
+        functions = source.functions(C.T), target.functions(np.eye(k))  # eq. 4: rows of both
+        given = options.of("registration")
+        return register(source, target, matches, functions, transform, k=k, **given)
+
+    if options.refine != "elastic":
+        return registered(C := refined(C)), C, kept
+    # elastic iterations do not use the functions
+    return *in_threads(lambda step: step(C), (refined, registered))[::-1], kept
 
 
 def match_both(

@@ -16,7 +16,9 @@ from s4a.geometry.mesh import (
     edges,
     equal_rows,
     lexical_order,
+    norms,
     path_lengths,
+    sums_at_vertices,
     triangle_areas,
     unique_edges,
 )
@@ -117,6 +119,30 @@ def test_paths_are_those_of_dijkstra_from_neighbours_to_the_limit(sphere):
     start, end = np.divmod(np.arange(0, len(X) ** 2, 97), len(X))
     whole = dijkstra(G)[start, end]
     assert np.allclose(path_lengths(G, start, end, 0.8), np.minimum(whole, 0.8), atol=1e-12)
+
+
+def test_paths_that_are_searched_around_their_ends_are_the_same(sphere):
+    X, T = sphere
+    G = edge_graph(X, edges(T))
+    start, end = np.divmod(np.arange(0, len(X) ** 2, 97), len(X))
+    for limit in (0.8, 9.0):
+        whole = path_lengths(G, start, end, limit)
+        assert np.array_equal(path_lengths(G, start, end, limit, X), whole)
+
+
+@pytest.mark.parametrize("d", [1, 3, 6])
+def test_norms_are_those_of_numpy(d):
+    vectors = np.random.default_rng(0).normal(size=(1000, d))
+    assert np.array_equal(norms(vectors), np.linalg.norm(vectors, axis=1))
+
+
+def test_sums_at_vertices_are_those_of_bincount(sphere):
+    X, T = sphere
+    values = np.random.default_rng(0).normal(size=(len(T), 2))
+    sums = [np.bincount(T.ravel(), np.repeat(column, 3), len(X)) for column in values.T]
+    assert np.array_equal(sums_at_vertices(T, values, len(X)), np.stack(sums, axis=1))
+    with pytest.raises(IndexError, match="numbers from 0 to 9"):
+        sums_at_vertices(T, values, 10)
 
 
 def test_no_pairs_have_no_paths(sphere):
