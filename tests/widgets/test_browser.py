@@ -59,7 +59,7 @@ PROGRESS = """
 import s4a
 from s4a.widgets import Progress
 
-Progress(s4a.synthetic.brains(3, 8000, seed=1), {store!r}, n_coarse=300, k=12, k_init=6, n_jobs=1)
+Progress(s4a.synthetic.brains(5, 8000, seed=1), {store!r}, n_coarse=300, k=12, k_init=6, n_jobs=1)
 """
 
 
@@ -641,7 +641,6 @@ def test_an_analysis_is_opened_while_it_runs_and_cancelled_and_resumed(
     page.wait_for_selector("text=cancelled; press Resume")
     kept = {path: path.stat().st_mtime_ns for path in (folder / "run" / "coarse").glob("*.nc")}
     assert kept, "remeshed before the button came; how many, the machine's speed decides"
-    assert not (folder / "run" / "pca.nc").exists()
     page.get_by_role("button", name="Resume", exact=True).click()
     page.wait_for_selector("text=/finished, \\d/", timeout=180_000)
     assert (folder / "run" / "pca.nc").exists()
