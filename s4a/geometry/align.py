@@ -217,8 +217,8 @@ def many_farthest_points(P: Array, k: int, *, center: Array, seed: int = 0) -> A
     if seed:
         extra[0, :-1] = -P[np.argsort(-radius, kind="stable")[seed % len(P)]]
     points = np.concatenate([extra, np.c_[P, np.zeros(len(P))]])  # (n + 1, d + 1)
-    # of the tree; each leaf needs a point
-    height = min(depth := int(np.log2(len(points))), max(7, depth - 9))
+    most = int(np.log2(len(points)))  # height of the tree: each leaf needs a point
+    height = min(most, max(7, most - 9))
     sample = fpsample.bucket_fps_kdline_sampling(points, k + 1, h=height, start_idx=0)
     _, first = np.unique(sample, return_index=True)
     return sample[np.sort(first)][1:].astype(np.int64) - 1

@@ -110,7 +110,7 @@ def _check_numbers(x, names, what):
             )
         log.warning("%s: correct the value, or write NA, if it is wrong; the test uses it", text)
     if rest.sum() > 1 and all(_DATE.fullmatch(cells[i]) for i in np.flatnonzero(rest)):
-        text = "%s: %s look like dates, in whose digits a month is 100 days: write days or years"
+        text = "%s: %s look like dates, whose differences are not days: write days or years"
         log.warning(text, what, _range(x[rest]))
     sizes = " and ".join(map(_range, _two_sizes(usual)))
     if sizes:

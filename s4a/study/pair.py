@@ -226,10 +226,12 @@ def _complete(source, target, initial, transform, k, options):
         given = options.of("registration")
         return register(source, target, matches, functions, transform, k=k, **given)
 
-    if options.refine != "elastic":
-        return registered(C := refined(C)), C, kept
-    # elastic iterations do not use the functions
-    return *in_threads(lambda step: step(C), (refined, registered))[::-1], kept
+    if options.refine == "elastic":  # without the functions of the refined map
+        C, registration = in_threads(lambda step: step(C), (refined, registered))
+    else:
+        C = refined(C)
+        registration = registered(C)
+    return registration, C, kept
 
 
 def match_both(

@@ -127,7 +127,7 @@ def move(slider, value, *, let_go=False):
 
 
 def comms(page, before):
-    """What the page sent to Python after the first messages, without requests of JupyterLab."""
+    """What panels sent after the first `before` messages, without requests of JupyterLab."""
     return [text for text in page.sent[before:] if b"comm_msg" in bytes(text)]
 
 
