@@ -28,6 +28,9 @@ POSE_DISTANCE = 0.035  # 90 % quantile of distances above which poses differ, se
 N_TRIPS, LONGEST_TRIP = 300, 0.5  # samples of the round trip, and its largest error
 MANY = 20_000  # vertices above which paths are searched locally
 GOOD = 0.03  # score up to which no spectral coordinates are tried
+# weights of spectral coordinates in piecewise rigid iterations.  With few functions a hand moves
+# with its arm, and only the spectral match knows where it belongs (docs/decisions.md)
+SPECTRAL = (0.7, 0.2)
 
 Warp = tuple[Array, Array, Array]
 
@@ -104,7 +107,7 @@ def coarse_spectral_icp(
     k: int = 100,
     step: int = 5,
     iterations: int = 2,
-    spectral: float = 0.0,
+    spectral: tuple[float, float] | None = None,
     articulated: bool = False,
 ) -> tuple[Array, Warp]:
     """Spectral ICP on low-resolution meshes, for K = k_initial, k_initial + step, ..., k.
@@ -115,9 +118,10 @@ def coarse_spectral_icp(
         At low resolution.
     match : int ndarray (n_target,)
         Initialisation, for example by ZoomOut.
-    spectral : float
-        Spectral coordinates have the weight ``spectral / sqrt(K)``; with 0 a KD-tree of 6
-        dimensions is searched.
+    spectral : tuple of float, optional
+        Spectral coordinates have the weight ``spectral / sqrt(K)``, from the first value at the
+        first K to the second at the last, by equal factors; without, a KD-tree of 6 dimensions is
+        searched.
     articulated : bool
         Whether the warp is piecewise rigid, see :func:`s4a.method.deform.rigid_parts`.
 
@@ -127,7 +131,9 @@ def coarse_spectral_icp(
     warp : tuple (R, t, c)
     """
     k = min(k, target.k, source.k)
-    for K in [*range(min(k_initial, k), k, step), k]:
+    sizes = [*range(min(k_initial, k), k, step), k]
+    weights = np.geomspace(*spectral, len(sizes)) if spectral else np.zeros(len(sizes))
+    for K, weight in zip(sizes, weights, strict=True):
         Phi = target.Phi[:, :K]
         spectrum = (target.mass, Phi, target.eigenvalue[:K]) if articulated else None
 
@@ -137,14 +143,13 @@ def coarse_spectral_icp(
         for _ in range(iterations):
             warp = onto(target.X, source.X[match], target.area, coefficients, spectrum)
             X = move(target, warp)
-            if not spectral:
+            if not weight:
                 match = nearest_vertices(source, target.moved_to(X))
                 continue
-            weight = spectral / np.sqrt(K)
             C = fmap_from_match(source.Phi[:, :K], Phi, target.mass, match)
             match = nearest_rows(
-                features(X, vertex_normals(X, target.T), weight * Phi),
-                features(source.X, source.normals, weight * source.Phi[:, :K] @ C.T),
+                features(X, vertex_normals(X, target.T), weight / np.sqrt(K) * Phi),
+                features(source.X, source.normals, weight / np.sqrt(K) * source.Phi[:, :K] @ C.T),
             )
     return match, warp
 
@@ -293,11 +298,11 @@ def candidates(
     initial = source, target, matches[best]
     if articulated and all(poses_differ(source, target, match) for match in matches.values()):
         piecewise = coarse_spectral_icp(
-            *initial, k_initial=20, k=k, iterations=1, spectral=0.2, articulated=True
+            *initial, k_initial=20, k=k, iterations=1, spectral=SPECTRAL, articulated=True
         )
         add(f"{best}+parts", *piecewise)
     elif min(candidate.score for candidate in results.values()) > GOOD:
-        add(f"{best}+joint+spectral", *coarse_spectral_icp(*initial, k=k, spectral=0.1))
+        add(f"{best}+joint+spectral", *coarse_spectral_icp(*initial, k=k, spectral=(0.1, 0.1)))
     return results
 
 

@@ -40,14 +40,14 @@ def test_spectral_icp_keeps_the_identity(surface):
     assert spectral_icp.move(surface, transform) == pytest.approx(surface.X, abs=1e-12)
 
 
-@pytest.mark.parametrize("spectral_weight", [0.0, 0.1])
+@pytest.mark.parametrize("spectral", [None, (0.1, 0.1), (0.7, 0.2)])
 def test_a_simulated_deformation_is_recovered_far_more_accurately_than_by_nearest_neighbours(
-    surface, spectral_weight
+    surface, spectral
 ):
     source = moved(surface, surface.X + bumps(surface.X))
     start = cKDTree(source.X).query(surface.X)[1]
     match, transform = spectral_icp.coarse_spectral_icp(
-        source, surface, start, k=60, spectral=spectral_weight
+        source, surface, start, k=60, spectral=spectral
     )
     error = np.linalg.norm(spectral_icp.move(surface, transform) - source.X, axis=1).mean()
     nearest = np.linalg.norm(source.X[start] - source.X, axis=1).mean()
