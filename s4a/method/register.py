@@ -260,6 +260,7 @@ def from_latent(
     match, functions = match_low(source, target, bases, dense_match=dense_match)
     by_icp = nearest_after_alignment(source.low, target.low, transform)
     matches = {"intrinsic": match, "icp": by_icp}
+    options["spectral"] = spectral_icp.NETWORK
     return register(source, target, matches, functions, transform, k=len(bases[0]), **options)
 
 
@@ -274,6 +275,7 @@ def register(
     refine: str = "elastic",
     remove_size: bool = False,
     articulated: bool = True,
+    spectral: tuple[float, float] = spectral_icp.PAIR,
     displacement_alignment: str = "fitted",
 ) -> xr.Dataset:
     """Register one shape to the template at full resolution.
@@ -300,6 +302,8 @@ def register(
         Whether to remove size from the displacement.
     articulated : bool
         Whether spectral ICP may be piecewise rigid if poses differ.
+    spectral : tuple of float
+        Weights of spectral coordinates then, see :func:`s4a.method.spectral_icp.candidates`.
     displacement_alignment : {"fitted", "initial"}
         Measure the displacement after the rigid transform that fits the registered surface best, or
         after the initial one as in the paper; then eq. 8 and (U Phi)(U Phi)^+ hold as printed.
@@ -320,7 +324,7 @@ def register(
     """
     check("displacement_alignment", displacement_alignment)
     candidates = find_candidates(
-        source, target, matches, k=k, refine=refine, articulated=articulated
+        source, target, matches, k=k, refine=refine, articulated=articulated, spectral=spectral
     )
     by_icp = None
     if displacement_alignment == "initial":
@@ -391,6 +395,7 @@ def find_candidates(
     k: int = 100,
     refine: str = "elastic",
     articulated: bool = True,
+    spectral: tuple[float, float] = spectral_icp.PAIR,
 ) -> dict[str, spectral_icp.Candidate]:
     """Return the low-resolution candidates to initialise full resolution, with their scores.
 
@@ -399,7 +404,7 @@ def find_candidates(
 
     Parameters
     ----------
-    source, target, matches, k, refine, articulated : see :func:`register`
+    source, target, matches, k, refine, articulated, spectral : see :func:`register`
 
     Returns
     -------
@@ -413,7 +418,9 @@ def find_candidates(
     if refine == "spectral_icp" or all(
         spectral_icp.poses_differ(M, N, match) for match in matches.values()
     ):
-        return spectral_icp.candidates(M, N, matches, k=k, articulated=articulated)
+        return spectral_icp.candidates(
+            M, N, matches, k=k, articulated=articulated, spectral=spectral
+        )
     return spectral_icp.unrefined_candidates(M, N, matches)
 
 

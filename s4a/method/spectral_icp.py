@@ -28,9 +28,10 @@ POSE_DISTANCE = 0.035  # 90 % quantile of distances above which poses differ, se
 N_TRIPS, LONGEST_TRIP = 300, 0.5  # samples of the round trip, and its largest error
 MANY = 20_000  # vertices above which paths are searched locally
 GOOD = 0.03  # score up to which no spectral coordinates are tried
-# weights of spectral coordinates in piecewise rigid iterations.  With few functions a hand moves
-# with its arm, and only the spectral match knows where it belongs (docs/decisions.md)
-SPECTRAL = (0.7, 0.2)
+# first and last weight of spectral coordinates in piecewise rigid iterations.  With few functions a
+# hand moves with its arm, so consistent maps of a network, which are more accurate than those of a
+# pair, count more at first (docs/decisions.md)
+PAIR, NETWORK = (0.2, 0.2), (0.7, 0.2)
 
 Warp = tuple[Array, Array, Array]
 
@@ -265,6 +266,7 @@ def candidates(
     *,
     k: int = 100,
     articulated: bool = True,
+    spectral: tuple[float, float] = PAIR,
 ) -> dict[str, Candidate]:
     """Return candidates at low resolution: every initial match, before and after spectral ICP.
 
@@ -280,6 +282,8 @@ def candidates(
         Name -> match (n_target,).
     articulated : bool
         Whether to try piecewise rigid iterations.
+    spectral : tuple of float
+        Weights of spectral coordinates in these, see :func:`coarse_spectral_icp`.
 
     Returns
     -------
@@ -298,7 +302,7 @@ def candidates(
     initial = source, target, matches[best]
     if articulated and all(poses_differ(source, target, match) for match in matches.values()):
         piecewise = coarse_spectral_icp(
-            *initial, k_initial=20, k=k, iterations=1, spectral=SPECTRAL, articulated=True
+            *initial, k_initial=20, k=k, iterations=1, spectral=spectral, articulated=True
         )
         add(f"{best}+parts", *piecewise)
     elif min(candidate.score for candidate in results.values()) > GOOD:
