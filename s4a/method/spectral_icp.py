@@ -2,7 +2,7 @@
 
 The match lives on the target N, the source M is searched.  An iteration moves N onto M with a
 displacement in the first K eigenfunctions of N, then finds nearest neighbours in position, normal
-and, with ``spectral > 0``, spectral coordinates together; K grows as in ZoomOut.  Smooth Shells
+and, with ``spectral``, spectral coordinates together; K grows as in ZoomOut.  Smooth Shells
 (Eisenberger, Laehner, Cremers, CVPR 2020) couples both in this way.  If poses differ much, the
 displacement is piecewise rigid first.  All lengths are for surfaces of unit area.
 

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from paths import DATA
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from s4a import coarsen, spectrum, synthetic
-from s4a.geometry.mesh import as_arrays, vertex_areas, vertex_normals
+from s4a import clean, coarsen, spectrum, synthetic
+from s4a.geometry.mesh import as_arrays, as_dataset, vertex_areas, vertex_normals
 from s4a.method import deform, spectral_icp
 from s4a.method.shape import Shape
 
@@ -55,6 +56,35 @@ def test_a_simulated_deformation_is_recovered_far_more_accurately_than_by_neares
     assert error < 0.005
     assert error < nearest / 4
     assert (match == np.arange(len(match))).mean() > 0.6
+
+
+@pytest.mark.skipif(not (DATA / "faust_r").is_dir(), reason="needs ../shared/data/faust_r")
+def test_hands_stay_where_the_consistent_map_of_a_network_puts_them():
+    shapes, corresponding = [], []
+    for number in (15, 11):  # a body with open hands, and one that makes fists
+        with np.load(DATA / "faust_r" / f"tr_reg_{number:03d}.npz") as body:
+            mesh = clean(as_dataset(body["vertices"].astype(float), body["faces"]))
+            vertex = mesh["vertex_of_file"].values[body["corres"]]
+        low = coarsen(mesh, n_coarse=6000)  # of all vertices, in another order
+        corresponding.append(np.argsort(low["sample_vertex"].values)[vertex])
+        shapes.append(Shape(mesh, spectrum(low, k=100)).low)
+    (source, target), (there, here) = shapes, corresponding
+    # the correspondence of the data, at the nearest vertices that have one
+    nearest = cKDTree(target.X[here]).query(target.X)[1]
+    errors = {}
+    for name, weights in (("pair", spectral_icp.PAIR), ("network", spectral_icp.NETWORK)):
+        match = spectral_icp.coarse_spectral_icp(
+            source,
+            target,
+            there[nearest],
+            k_initial=20,
+            iterations=1,
+            spectral=weights,
+            articulated=True,
+        )[0]
+        errors[name] = np.linalg.norm(source.X[match[here]] - source.X[there], axis=1)
+    largest = {name: np.quantile(error, 0.99) for name, error in errors.items()}
+    assert largest["network"] < 0.065 < largest["pair"]
 
 
 def test_a_rigid_motion_is_recovered_exactly_without_any_deformation(surface):
