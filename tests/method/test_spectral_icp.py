@@ -61,7 +61,7 @@ def test_a_simulated_deformation_is_recovered_far_more_accurately_than_by_neares
 @pytest.mark.skipif(not (DATA / "faust_r").is_dir(), reason="needs ../shared/data/faust_r")
 def test_hands_stay_where_the_consistent_map_of_a_network_puts_them():
     shapes, corresponding = [], []
-    for number in (15, 11):  # a body with open hands, and one that makes fists
+    for number in (15, 11):  # a body whose arms hang, and one with its hands on its hips
         with np.load(DATA / "faust_r" / f"tr_reg_{number:03d}.npz") as body:
             mesh = clean(as_dataset(body["vertices"].astype(float), body["faces"]))
             vertex = mesh["vertex_of_file"].values[body["corres"]]
