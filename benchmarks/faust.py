@@ -1,10 +1,10 @@
 """Bodies and cats by the published protocols: FAUST_r, TOSCA, the connectivity track of SHREC'19.
 
-``faust.py [cats] [--shapes N] [--pairs N] [--seed S] [--templates NAME ...]``: shapes
+``faust.py [cats] [--shapes N] [--pairs N] [--seed S] [--templates I ...]``: shapes
 000 to 019 of FAUST_r in the shared data beside the checkout, 5,000 vertices, remeshed separately;
 or the eleven cats of TOSCA, 27,894 vertices, of which vertex i is vertex i, at 500 of them.  All
-ordered pairs within one study, also with other templates than the median, and some pairs matched
-alone.
+ordered pairs within one study, also with other templates than the median, shapes by their number
+from 0, and some pairs matched alone.
 
 ``faust.py --shrec19 FOLDER [--pairs N]``: pairs of SHREC'19, *Matching Humans with Different
 Connectivity*, matched alone.  The data are not shipped; FOLDER is a copy of
@@ -130,7 +130,7 @@ def report(meshes, true, n_pairs, seed, templates):
         median, within, seconds = in_study(meshes, true, points, folder)
         row = f"one study of {len(meshes)} shapes, template"
         say(f"{row} {median}, the median", list(within.values()), seconds)
-        for template in templates:
+        for template in [list(meshes)[i] for i in templates]:
             _, *other = in_study(meshes, true, points, folder, template=template)
             say(f"{row} {template}", list(other[0].values()), other[1])
     chosen = list(within)
@@ -160,7 +160,7 @@ def main():
     parser.add_argument("--shapes", type=int, default=20)
     parser.add_argument("--pairs", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--templates", nargs="+", default=[], metavar="NAME")
+    parser.add_argument("--templates", type=int, nargs="+", default=[], metavar="I")
     parser.add_argument("--shrec19", type=Path, metavar="FOLDER")
     args = parser.parse_args()
     shares = ", ".join(map(str, CURVE))
