@@ -1,10 +1,10 @@
 """Bodies and cats by the published protocols: FAUST_r, TOSCA, the connectivity track of SHREC'19.
 
-``faust.py [cats] [--shapes N] [--pairs N] [--seed S] [--templates I ...]``: shapes
-000 to 019 of FAUST_r in the shared data beside the checkout, 5,000 vertices, remeshed separately;
-or the eleven cats of TOSCA, 27,894 vertices, of which vertex i is vertex i, at 500 of them.  All
-ordered pairs within one study, also with other templates than the median, shapes by their number
-from 0, and some pairs matched alone.
+``faust.py [cats] [--shapes N] [--pairs N] [--seed S] [--templates I ...]``: shapes 000 to 019 of
+FAUST_r in the shared data beside the checkout, 5,000 vertices, remeshed separately; or the eleven
+cats of TOSCA, 27,894 vertices, of which vertex i is vertex i, at 500 of them.  All ordered pairs
+within one study, and some pairs matched alone; with ``--templates`` also with other templates than
+the median, by their number from 0.
 
 ``faust.py --shrec19 FOLDER [--pairs N]``: pairs of SHREC'19, *Matching Humans with Different
 Connectivity*, matched alone.  The data are not shipped; FOLDER is a copy of
@@ -131,8 +131,8 @@ def report(meshes, true, n_pairs, seed, templates):
         row = f"one study of {len(meshes)} shapes, template"
         say(f"{row} {median}, the median", list(within.values()), seconds)
         for template in [list(meshes)[i] for i in templates]:
-            _, *other = in_study(meshes, true, points, folder, template=template)
-            say(f"{row} {template}", list(other[0].values()), other[1])
+            _, other, spent = in_study(meshes, true, points, folder, template=template)
+            say(f"{row} {template}", list(other.values()), spent)
     chosen = list(within)
     np.random.default_rng(seed).shuffle(chosen)
     chosen, single, spent = chosen[:n_pairs], [], 0.0

@@ -260,8 +260,8 @@ def from_latent(
     match, functions = match_low(source, target, bases, dense_match=dense_match)
     by_icp = nearest_after_alignment(source.low, target.low, transform)
     matches = {"intrinsic": match, "icp": by_icp}
-    options["spectral"] = spectral_icp.NETWORK
-    return register(source, target, matches, functions, transform, k=len(bases[0]), **options)
+    options |= {"k": len(bases[0]), "spectral": spectral_icp.NETWORK}
+    return register(source, target, matches, functions, transform, **options)
 
 
 def register(
@@ -303,7 +303,8 @@ def register(
     articulated : bool
         Whether spectral ICP may be piecewise rigid if poses differ.
     spectral : tuple of float
-        Weights of spectral coordinates then, see :func:`s4a.method.spectral_icp.candidates`.
+        First and last weight of spectral coordinates in the piecewise rigid iterations, see
+        :func:`s4a.method.spectral_icp.coarse_spectral_icp`.
     displacement_alignment : {"fitted", "initial"}
         Measure the displacement after the rigid transform that fits the registered surface best, or
         after the initial one as in the paper; then eq. 8 and (U Phi)(U Phi)^+ hold as printed.

@@ -120,9 +120,9 @@ def coarse_spectral_icp(
     match : int ndarray (n_target,)
         Initialisation, for example by ZoomOut.
     spectral : tuple of float, optional
-        Spectral coordinates have the weight ``spectral / sqrt(K)``, from the first value at the
-        first K to the second at the last, by equal factors; without, a KD-tree of 6 dimensions is
-        searched.
+        Spectral coordinates have the weight w / sqrt(K); w changes by equal factors, from the first
+        value at the first K to the second at the last.  By default they are not used, and a KD-tree
+        of 6 dimensions is searched.
     articulated : bool
         Whether the warp is piecewise rigid, see :func:`s4a.method.deform.rigid_parts`.
 
@@ -133,7 +133,9 @@ def coarse_spectral_icp(
     """
     k = min(k, target.k, source.k)
     sizes = [*range(min(k_initial, k), k, step), k]
-    weights = np.geomspace(*spectral, len(sizes)) if spectral else np.zeros(len(sizes))
+    weights = np.zeros(len(sizes))
+    if spectral is not None:
+        weights = np.geomspace(*spectral, len(sizes)) / np.sqrt(sizes)
     for K, weight in zip(sizes, weights, strict=True):
         Phi = target.Phi[:, :K]
         spectrum = (target.mass, Phi, target.eigenvalue[:K]) if articulated else None
@@ -149,8 +151,8 @@ def coarse_spectral_icp(
                 continue
             C = fmap_from_match(source.Phi[:, :K], Phi, target.mass, match)
             match = nearest_rows(
-                features(X, vertex_normals(X, target.T), weight / np.sqrt(K) * Phi),
-                features(source.X, source.normals, weight / np.sqrt(K) * source.Phi[:, :K] @ C.T),
+                features(X, vertex_normals(X, target.T), weight * Phi),
+                features(source.X, source.normals, weight * source.Phi[:, :K] @ C.T),
             )
     return match, warp
 
@@ -283,7 +285,7 @@ def candidates(
     articulated : bool
         Whether to try piecewise rigid iterations.
     spectral : tuple of float
-        Weights of spectral coordinates in these, see :func:`coarse_spectral_icp`.
+        First and last weight of spectral coordinates in these, see :func:`coarse_spectral_icp`.
 
     Returns
     -------
